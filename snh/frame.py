@@ -28,9 +28,7 @@ class Camera:
     def project(self, points_c: np.ndarray) -> np.ndarray:
         """Pixel coordinates (u, v) of points in the camera frame, [..., 3] m -> [..., 2]."""
         z = points_c[..., 2]
-        return np.stack(
-            [points_c[..., 0] / z * self.fx + self.cx, points_c[..., 1] / z * self.fy + self.cy], axis=-1
-        )
+        return np.stack([points_c[..., 0] / z * self.fx + self.cx, points_c[..., 1] / z * self.fy + self.cy], axis=-1)
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same camera after resizing its images to width x height."""
@@ -43,7 +41,11 @@ class Camera:
     def cropped(self, border: int) -> Camera:
         """The same camera after cutting `border` pixels from each side."""
         return replace(
-            self, width=self.width - 2 * border, height=self.height - 2 * border, cx=self.cx - border, cy=self.cy - border
+            self,
+            width=self.width - 2 * border,
+            height=self.height - 2 * border,
+            cx=self.cx - border,
+            cy=self.cy - border,
         )
 
 

@@ -29,17 +29,19 @@ inline const char* name_of(ScalarType type) { return torch::headeronly::toString
 // shape: one entry per dimension, -1 = any size.
 inline void check_shape(const char* op, const char* arg, const Tensor& t, const std::vector<int64_t>& shape) {
   bool ok = t.dim() == static_cast<int64_t>(shape.size());
-  for (size_t d = 0; ok && d < shape.size(); ++d) ok = shape[d] < 0 || t.size(static_cast<int64_t>(d)) == shape[d];
+  for (size_t d = 0; ok && d < shape.size(); ++d)
+    ok = shape[d] < 0 || t.size(static_cast<int64_t>(d)) == shape[d];
   if (ok) return;
   std::string want = "[";
   for (size_t d = 0; d < shape.size(); ++d)
     want += (d ? ", " : "") + (shape[d] < 0 ? std::string("*") : std::to_string(shape[d]));
-  STD_TORCH_CHECK(false, "snh::", op, ": argument '", arg, "' must have shape ", want, "], got ", shape_of(t));
+  STD_TORCH_CHECK(false, "snh::", op, ": argument '", arg, "' must have shape ", want, "], got ",
+                  shape_of(t));
 }
 
 inline void check_dtype(const char* op, const char* arg, const Tensor& t, ScalarType want) {
-  STD_TORCH_CHECK(t.scalar_type() == want, "snh::", op, ": argument '", arg, "' must be ", name_of(want), ", got ",
-                  name_of(t.scalar_type()));
+  STD_TORCH_CHECK(t.scalar_type() == want, "snh::", op, ": argument '", arg, "' must be ", name_of(want),
+                  ", got ", name_of(t.scalar_type()));
 }
 
 inline void check_floating(const char* op, const char* arg, const Tensor& t) {

@@ -18,9 +18,9 @@
 namespace snh {
 
 constexpr int kBrickBits = 3;
-constexpr int kBrickSide = 1 << kBrickBits;            // vertices along one side
+constexpr int kBrickSide = 1 << kBrickBits;              // vertices along one side
 constexpr int kBrickVertices = kBrickSide * kBrickSide;  // 64
-constexpr int32_t kBrickOffset = 1 << 27;              // makes brick coordinates non-negative in a key
+constexpr int32_t kBrickOffset = 1 << 27;                // makes brick coordinates non-negative in a key
 
 struct Brick {
   int level, plane;
@@ -29,7 +29,8 @@ struct Brick {
 
 SNH_HD inline int64_t pack_key(int level, int plane, int32_t brick_i, int32_t brick_j) {
   const uint64_t head = (static_cast<uint64_t>(level) << 2) | static_cast<uint64_t>(plane);
-  const uint64_t i = static_cast<uint32_t>(brick_i + kBrickOffset), j = static_cast<uint32_t>(brick_j + kBrickOffset);
+  const uint64_t i = static_cast<uint32_t>(brick_i + kBrickOffset),
+                 j = static_cast<uint32_t>(brick_j + kBrickOffset);
   return static_cast<int64_t>((head << 56) | (i << 28) | j);
 }
 
@@ -67,9 +68,10 @@ SNH_HD inline int32_t find_brick(int level, int plane, int32_t brick_i, int32_t 
 }
 
 // Slot of a vertex, or -1.
-SNH_HD inline int64_t find_slot(int level, int plane, int32_t i, int32_t j, const int32_t* probe, int64_t capacity,
-                                const int64_t* brick_keys, const int64_t* masks) {
-  const int32_t number = find_brick(level, plane, i >> kBrickBits, j >> kBrickBits, probe, capacity, brick_keys);
+SNH_HD inline int64_t find_slot(int level, int plane, int32_t i, int32_t j, const int32_t* probe,
+                                int64_t capacity, const int64_t* brick_keys, const int64_t* masks) {
+  const int32_t number =
+      find_brick(level, plane, i >> kBrickBits, j >> kBrickBits, probe, capacity, brick_keys);
   if (number < 0) return -1;
   const int local = local_of(i, j);
   return (masks[number] >> local) & 1 ? static_cast<int64_t>(number) * kBrickVertices + local : -1;

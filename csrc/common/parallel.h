@@ -7,7 +7,8 @@
 namespace snh {
 
 // Calls body(begin, end) on disjoint pieces that cover [0, n), in any order, possibly at the same time.
-using ParallelFor = std::function<void(int64_t n, const std::function<void(int64_t begin, int64_t end)>& body)>;
+using ParallelFor =
+    std::function<void(int64_t n, const std::function<void(int64_t begin, int64_t end)>& body)>;
 
 inline void serial_for(int64_t n, const std::function<void(int64_t, int64_t)>& body) { body(0, n); }
 

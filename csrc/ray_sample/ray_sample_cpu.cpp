@@ -29,6 +29,7 @@ void ray_sample(const T* depth, const T* uniforms, int64_t n_rays, int n_base, i
 }
 
 template void ray_sample<float>(const float*, const float*, int64_t, int, int, float, float, float, float*);
-template void ray_sample<double>(const double*, const double*, int64_t, int, int, double, double, double, double*);
+template void ray_sample<double>(const double*, const double*, int64_t, int, int, double, double, double,
+                                 double*);
 
 }  // namespace snh::cpu

@@ -1,10 +1,11 @@
-#include "common/check.h"
 #include "ray_sample/ray_sample.h"
+
+#include "common/check.h"
 
 namespace snh {
 
-static Tensor ray_sample(const Tensor& depth, const Tensor& uniforms, int64_t n_base, int64_t n_surface, double near,
-                         double far, double truncation) {
+static Tensor ray_sample(const Tensor& depth, const Tensor& uniforms, int64_t n_base, int64_t n_surface,
+                         double near, double far, double truncation) {
   constexpr const char* kOp = "ray_sample";
   check_floating(kOp, "depth", depth);
   check_dtype(kOp, "uniforms", uniforms, depth.scalar_type());
@@ -26,7 +27,8 @@ static Tensor ray_sample(const Tensor& depth, const Tensor& uniforms, int64_t n_
 
 STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
   m.def(
-      "ray_sample(Tensor depth, Tensor uniforms, int n_base, int n_surface, float near, float far, float truncation) "
+      "ray_sample(Tensor depth, Tensor uniforms, int n_base, int n_surface, float near, float far, float "
+      "truncation) "
       "-> Tensor");
 }
 STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) { m.impl("ray_sample", TORCH_BOX(&snh::ray_sample)); }
