@@ -1,0 +1,65 @@
+"""One door to all layouts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as AbstractSequence
+from pathlib import Path
+
+from snh.datasets import replica, seven_scenes
+from snh.datasets.recording import ReaderOptions
+from snh.datasets.sequence import Sequence, View, make_view
+from snh.errors import ConfigError, DataError
+
+FORMATS = {"7scenes": seven_scenes, "replica": replica}
+
+
+def open_sequence(
+    source: str | Path, *, format: str = "auto",
+    intrinsics: str | Path | AbstractSequence[float] | None = None, depth_scale: float | None = None,
+    depth_max: float | None = None, max_time_difference: float = 0.02,
+    start: int = 0, frames: int | None = None, stride: int = 1,
+    resize: tuple[int, int] | None = None, crop: int = 0,
+) -> View:  # fmt: skip
+    """Opens a recording; nothing but the list of files, the poses and the first headers is read.
+
+    source: a folder in one of FORMATS, a ScanNet .sens file, or "builtin[:variant]", the scene that needs no files.
+    format: one of FORMATS, or "auto" to recognise it.
+    intrinsics: (fx, fy, cx, cy) in px, the text "fx,fy,cx,cy", or a calibration file; else a file in the folder says.
+    depth_scale: units of the depth files per metre; depth_max: readings beyond so many m count as none.
+    max_time_difference: s, largest one within a pair of colour and depth or pose (TUM layout only).
+    start, frames, stride: which frames; resize: (width, height), then crop: pixels cut from each side.
+    Raises DataError or ConfigError with one sentence. `check` looks further before a long run.
+    """
+    options = ReaderOptions(intrinsics, depth_scale, max_time_difference)
+    sequence = _open(source, format, options)
+    return make_view(sequence, start=start, frames=frames, stride=stride, resize=resize, crop=crop, depth_max=depth_max)
+
+
+def _open(source: str | Path, format: str, options: ReaderOptions) -> Sequence:
+    if format != "auto" and format not in FORMATS:
+        raise ConfigError(f"format {format} is unknown; use auto, {', '.join(FORMATS)}")
+    if str(source).partition(":")[0] == "builtin":
+        return _open_builtin(str(source), options)
+    folder = Path(source)
+    if not folder.exists():
+        raise DataError(f"{folder} does not exist; give the folder of a recording, or builtin")
+    if not folder.is_dir():
+        raise DataError(f"{folder} is not a folder; give the folder of a recording")
+    if next(folder.iterdir(), None) is None:
+        raise DataError(f"{folder} is empty; give the folder that holds the images of a recording")
+    if format != "auto":
+        return FORMATS[format].open_folder(folder, options)
+    for layout in FORMATS.values():
+        if layout.matches(folder):
+            return layout.open_folder(folder, options)
+    wanted = "; ".join(layout.LAYOUT for layout in FORMATS.values())
+    raise DataError(f"{folder} has none of the known layouts: {wanted}; give the folder that holds these")
+
+
+def _open_builtin(source: str, options: ReaderOptions) -> Sequence:
+    if options.intrinsics is not None or options.depth_scale is not None:
+        raise ConfigError("the builtin scene has its own camera; leave out intrinsics and depth_scale")
+    from snh.datasets.builtin import BuiltinSequence  # needs the compiled extension, which readers of files do not
+
+    variant = source.partition(":")[2]
+    return BuiltinSequence(variant) if variant else BuiltinSequence()
