@@ -1,0 +1,204 @@
+"""What the command line does: a whole run with its files, the demo, meshing a finished run, comparing results."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from tqdm import tqdm
+
+from snh.config import Config, load_config
+from snh.datasets import FrameError, Sequence, prefetch
+from snh.errors import DataError, OutputError, SNHError
+from snh.eval.trajectory import align, ate, read_tum, write_tum
+from snh.files import write_atomically
+from snh.geometry import inverse
+from snh.mesh import Mesh, extract_mesh
+from snh.slam import SLAM
+from snh.slam.map_file import load_map, save_map
+
+
+@dataclass
+class Run:
+    """A SLAM run in progress: the system, what each frame was, and the clock."""
+
+    slam: SLAM
+    indices: list[int] = field(default_factory=list)  # of the frames that were used, in the sequence
+    timestamps: list[float] = field(default_factory=list)
+    skipped: dict[int, str] = field(default_factory=dict)  # frames that could not be read
+    init_s: float = 0.0
+    tracking_s: float = 0.0
+    interrupted: bool = False
+
+
+def run_sequence(
+    sequence: Sequence, config: Config, out: Path, seed: int, threads: int | None, with_mesh: bool, quiet: bool
+) -> int:
+    """SLAM over a sequence; results in `out`. Returns the exit code: 0, or 130 after an interrupt."""
+    if len(sequence) < 2:
+        raise DataError(f"'{sequence.name}' has a single frame; SLAM needs at least two")
+    prepare_output(out)
+    run = track_sequence(sequence, config, seed, threads, quiet)
+    metrics, _ = save_run(run, sequence, config, out, with_mesh)
+    print(summary(metrics, out))
+    return 130 if run.interrupted else 0
+
+
+def prepare_output(out: Path) -> None:
+    """Creates the output folder and proves that it can be written before any work is done."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OutputError(f"cannot write to the output folder {out}: {error.strerror}; choose another with -o") from error
+
+
+def track_sequence(sequence: Sequence, config: Config, seed: int, threads: int | None, quiet: bool) -> Run:
+    """Tracks and maps every frame; Ctrl-C ends after the frame in work."""
+    torch.set_num_threads(threads or os.cpu_count() or 1)
+    run = Run(SLAM(sequence.camera, config, seed))
+    stop = _on_interrupt(run)
+    bar = tqdm(total=len(sequence), unit="frame", disable=quiet, dynamic_ncols=True)
+    start = time.perf_counter()
+    try:
+        for item in prefetch(sequence, range(len(sequence))):
+            bar.update()
+            if isinstance(item, FrameError):
+                run.skipped[item.index] = str(item)
+                bar.write(f"frame {item.index} is skipped: {item}", file=sys.stderr)
+                continue
+            result = run.slam.step(item)
+            run.indices.append(item.index)
+            run.timestamps.append(item.timestamp)
+            if result.status == "first":
+                run.init_s = time.perf_counter() - start
+            elif result.status != "ok":
+                bar.write(f"frame {item.index}: {result.status}; " + CONSEQUENCE[result.status], file=sys.stderr)
+            bar.set_postfix_str(_state(run), refresh=False)
+            if run.interrupted:
+                break
+    finally:
+        signal.signal(signal.SIGINT, stop)
+        bar.close()
+    run.tracking_s = time.perf_counter() - start - run.init_s
+    return run
+
+
+CONSEQUENCE = {
+    "no depth": "its pose is extrapolated and it is not mapped",
+    "no colour": "it is tracked by its depth alone and not mapped",
+    "lost": "its depth fits the map badly, so it is not mapped",
+}
+
+
+def _on_interrupt(run: Run):
+    """First Ctrl-C: finish the frame and save everything. Second: Python's own KeyboardInterrupt."""
+
+    def handler(signum, frame):
+        run.interrupted = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        print("\ninterrupted: saving what there is (Ctrl-C again to drop it)", file=sys.stderr)
+
+    return signal.signal(signal.SIGINT, handler)
+
+
+def _state(run: Run) -> str:
+    megabytes = run.slam.field.encoding.memory_bytes(occupied=True) / 1e6
+    return f"keyframes {len(run.slam.keyframes)}, map {megabytes:.2f} MB"
+
+
+def save_run(run: Run, sequence: Sequence, config: Config, out: Path, with_mesh: bool) -> tuple[dict, Mesh | None]:
+    """Writes every result of a run to `out`; each file is complete or absent. Returns the metrics and the mesh."""
+    from snh.viz import draw_path
+
+    slam = run.slam
+    T_wc = slam.trajectory()
+    write_tum(out / "trajectory.txt", run.timestamps, T_wc)
+    write_atomically(out / "config.yaml", yaml.safe_dump(config.to_dict(), sort_keys=False).encode())
+    write_atomically(out / "frames.csv", _frame_table(run).encode())
+    save_map(out / "map.npz", slam, config)
+
+    reference = sequence.reference()
+    T_ref = None if reference is None else reference[run.indices]
+    metrics = measure(run, T_wc, T_ref)
+    write_atomically(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    draw_path(out / "path.png", T_wc, T_ref)
+
+    mesh = None
+    if with_mesh:
+        mesh = extract_mesh(slam.field, config.mesh.voxel)
+        mesh.save(out / "mesh.ply")
+        mesh.save(out / "mesh.glb")
+        draw_mesh(mesh, T_wc, slam.camera, out)
+    metrics["peak_rss_mb"] = _peak_rss_mb()
+    write_atomically(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    return metrics, mesh
+
+
+def measure(run: Run, T_wc: np.ndarray, T_ref: np.ndarray | None) -> dict:
+    """The figures of a run; `ate_rmse_cm` is null without reference poses."""
+    results, encoding = run.slam.results, run.slam.field.encoding
+    error = None if T_ref is None else ate(T_wc, T_ref)
+    statuses = [r.status for r in results]
+    return {
+        "frames": len(results),
+        "fps": (len(results) - 1) / run.tracking_s if len(results) > 1 else None,
+        "init_s": run.init_s,
+        "ate_rmse_cm": None if error is None else error.rmse_cm,
+        "ate_max_cm": None if error is None else error.max_cm,
+        "ate_frames": None if error is None else error.n_frames,
+        "map_bytes_occupied": encoding.memory_bytes(occupied=True),
+        "map_bytes_held": encoding.memory_bytes(occupied=False),
+        "peak_rss_mb": _peak_rss_mb(),
+        "n_keyframes": len(run.slam.keyframes),
+        "frames_lost": statuses.count("lost"),
+        "frames_without_depth": statuses.count("no depth"),
+        "frames_without_colour": statuses.count("no colour"),
+        "frames_unreadable": len(run.skipped),
+        "residual_cm": float(np.nanmedian([r.residual_cm for r in results[1:]])) if len(results) > 1 else None,
+        "interrupted": run.interrupted,
+    }
+
+
+def _peak_rss_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _frame_table(run: Run) -> str:
+    """frames.csv: what became of each frame."""
+    lines = ["frame,timestamp,status,keyframe,residual_cm,inlier_share,track_ms,map_ms"]
+    for result, timestamp in zip(run.slam.results, run.timestamps, strict=True):
+        lines.append(
+            f"{result.index},{timestamp:.6f},{result.status},{int(result.is_keyframe)},{result.residual_cm:.3f},"
+            f"{result.inlier_share:.3f},{result.track_ms:.2f},{result.map_ms:.2f}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def summary(metrics: dict, out: Path) -> str:
+    """The table at the end of a run."""
+    rows = [
+        ("frames", f"{metrics['frames']} ({metrics['n_keyframes']} keyframes)"),
+        ("speed", "-" if metrics["fps"] is None else f"{metrics['fps']:.1f} frames/s, first frame {metrics['init_s']:.1f} s"),
+        ("map", f"{metrics['map_bytes_occupied'] / 1e6:.2f} MB occupied, {metrics['map_bytes_held'] / 1e6:.2f} MB held"),
+        ("peak memory", f"{metrics['peak_rss_mb']:.0f} MB"),
+    ]  # fmt: skip
+    if metrics["ate_rmse_cm"] is not None:
+        rows.insert(1, ("ATE RMSE", f"{metrics['ate_rmse_cm']:.2f} cm over {metrics['ate_frames']} frames"))
+    rows += [(name.replace("_", " "), f"{metrics[name]:.2f}") for name in RECONSTRUCTION if name in metrics]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join([f"  {name:<{width}}  {value}" for name, value in rows] + [f"  results in {out}"])
+
+
+RECONSTRUCTION = ("accuracy_cm", "completion_cm", "completion_ratio_5cm_pct", "depth_l1_cm")
