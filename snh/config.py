@@ -32,6 +32,7 @@ class MapConfig:
     coarsest_cell: float = _number(0.32, 1e-4)  # m, z_max
     n_features: int = _number(3, 1, 4)  # per vertex
     hull_scale: float = _number(1.1, 1.0)  # mu of eq. 2; the paper says > 1
+    level_axes: bool = True  # turn the world to the main directions of the first view; datasets bring this with them
     allocation: str = _choice("hull", "hull", "surface", "frustum_box")
     hidden: int = _number(32, 8, 64)  # width of both hidden layers of both decoders, a multiple of 8
     n_geometry: int = _number(15, 1, 31)  # length of rho, eq. 5; open in the paper

@@ -14,6 +14,7 @@ from snh.errors import DataError
 from snh.frame import Camera, Frame
 from snh.geometry import inverse, orthonormal
 from snh.nn import SceneField
+from snh.slam.alignment import main_directions
 from snh.slam.keyframes import KeyframeLibrary
 from snh.slam.mapper import Mapper
 from snh.slam.rays import clean_depth
@@ -41,7 +42,7 @@ class SLAM:
 
         slam = SLAM(camera)
         for rgb, depth in stream:            # [H, W, 3] uint8, [H, W] float32 m, 0 = no reading
-            T_wc = slam.track(rgb, depth)    # [4, 4] camera to world; the first camera is the world
+            T_wc = slam.track(rgb, depth)    # [4, 4] camera to world; the first camera is at its origin
 
     Two instances with equal config, seed, number of threads and frames give equal results, bit for bit.
     """
@@ -100,10 +101,13 @@ class SLAM:
                 f"frame {frame.index} is the first and has no depth reading between {self.config.input.depth_min} and "
                 f"{self.config.input.depth_max} m; start at a later frame or check the depth scale"
             )
+        T_wc = np.eye(4)
+        if self.config.map.level_axes:
+            T_wc[:3, :3] = main_directions(depth, self.camera)
         self._anchors.append((0, np.eye(4)))
-        self._map(frame, depth, np.eye(4), self.config.mapping.first_iterations)
+        self._map(frame, depth, T_wc, self.config.mapping.first_iterations)
         map_ms = 1000 * (time.perf_counter() - start)
-        return self._record(frame, "first", Tracked(np.eye(4), 0.0, 1.0), True, 0.0, map_ms)
+        return self._record(frame, "first", Tracked(T_wc, 0.0, 1.0), True, 0.0, map_ms)
 
     def _usable(self, frame: Frame, depth: np.ndarray) -> str:
         if np.count_nonzero(depth[::4, ::4]) < 16:

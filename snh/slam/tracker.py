@@ -59,7 +59,7 @@ class Tracker:
         """Pose of the frame; depth [H, W] m is its cleaned depth, `starts` the initial poses to choose from."""
         config = self.config
         find = {"adam": self._adam, "gauss_newton": self._gauss_newton}[config.tracker]
-        rays, uniforms = self._draw(frame, depth, config.n_rays)
+        rays, _ = self._draw(frame, depth, config.n_rays)
         T_wc = min(starts, key=lambda T: self._misfit(T, rays)) if len(starts) > 1 else starts[0]
         T_wc = find(frame, depth, T_wc, reference)
         distance = np.abs(self._surface(T_wc, rays, np.full((len(rays.depth), 1), 0.5, np.float32))[0][:, 0])
