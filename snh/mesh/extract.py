@@ -21,6 +21,7 @@ Query = Callable[[np.ndarray, bool], tuple[Any, Any, Any]]
 _QUERY_POINTS = 1 << 18  # points per call of the query
 _MAX_SLOPE = 2.0  # the field may rise this many times faster than a true distance before a thin surface can be skipped
 _KEY_BITS = 20  # bits per axis of a lattice corner in the key of an edge
+_SNAP = 1e-3  # cells; vertices nearer to a lattice corner are put there, so that no slivers surround a zero corner
 
 
 def extract_mesh(
@@ -56,7 +57,7 @@ def box_blocks(low: np.ndarray, high: np.ndarray, voxel: float, block: int = 64)
     size = voxel * block
     first = np.floor(np.asarray(low) / size).astype(np.int64)
     last = np.ceil(np.asarray(high) / size).astype(np.int64)
-    axes = [np.arange(first[k], max(last[k], first[k] + 1)) for k in range(3)]
+    axes = [np.arange(a, max(b, a + 1)) for a, b in zip(first, last, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -66,12 +67,9 @@ def candidate_blocks(brick_keys: np.ndarray, finest_cell: float, voxel: float, b
     brick_keys: [N] int64 as packed in csrc/common/key.h. finest_cell: cell size of level 0, m.
     """
     level, plane, bricks = unpack_keys(brick_keys)
-    spans = []
-    for k in range(3):
-        spans.append(_blocks_of_bricks(bricks[(level == 0) & (plane == k)], 8 * finest_cell, voxel * block))
-    xy, yz, zx = spans
-    axes = [np.intersect1d(a, b) for a, b in ((xy[:, 0], zx[:, 1]), (xy[:, 1], yz[:, 0]), (yz[:, 1], zx[:, 0]))]
-    x, y, z = axes
+    finest = [bricks[(level == 0) & (plane == k)] for k in range(3)]
+    xy, yz, zx = (_blocks_of_bricks(of_plane, 8 * finest_cell, voxel * block) for of_plane in finest)
+    x, y, z = np.intersect1d(xy[:, 0], zx[:, 1]), np.intersect1d(xy[:, 1], yz[:, 0]), np.intersect1d(yz[:, 1], zx[:, 0])
     occupied = _raster(xy, x, y)[:, :, None] & _raster(yz, y, z)[None] & _raster(zx, z, x).T[:, None, :]
     i, j, k = np.nonzero(occupied)
     return np.stack([x[i], y[j], z[k]], axis=-1)
@@ -107,7 +105,7 @@ def _raster(pairs: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def _block_surface(
     query: Query, origin: np.ndarray, voxel: float, truncation: float, block: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(origin [3], corners [V, 3] float32 in cells from the origin, faces [F, 3]) of one block's surface."""
+    """(origin [3], vertices [V, 3] float32 in cells from the origin, faces [F, 3]) of one block's surface."""
     tsdf, known = _sample_block(query, origin, voxel, truncation, block)
     if not (known.any() and (tsdf[known] < 0).any() and (tsdf[known] >= 0).any()):
         return origin, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64)
@@ -115,12 +113,13 @@ def _block_surface(
 
     # Open3D's volume is [z, y, x] and its triangles face falling values; hence the turns.
     volume = np.ascontiguousarray(np.where(known, tsdf, 1).transpose(2, 1, 0))
-    surface = o3d.t.geometry.TriangleMesh.create_isosurfaces(o3d.core.Tensor(volume), [0.0])
+    surface = o3d.t.geometry.TriangleMesh.create_isosurfaces(o3d.core.Tensor.from_numpy(volume), [0.0])
     vertices = surface.vertex.positions.numpy()
     faces = surface.triangle.indices.numpy()[:, ::-1]
     cell = np.clip(np.floor(vertices[faces].mean(axis=1)).astype(np.int64), 0, block - 1)
     complete = _all_corners(known)[tuple(cell.T)]
-    return origin, vertices, faces[complete]
+    corner = np.round(vertices)
+    return origin, np.where(np.abs(vertices - corner) < _SNAP, corner, vertices), faces[complete]
 
 
 def _sample_block(
@@ -200,21 +199,21 @@ def _weld(pieces: list[tuple[np.ndarray, np.ndarray, np.ndarray]], voxel: float)
     if not pieces:
         return Mesh.empty()
     lowest = np.min([origin for origin, _, _ in pieces], axis=0)
-    keys = np.concatenate([_edge_keys(corners, origin - lowest) for origin, corners, _ in pieces])
+    keys = np.concatenate([_edge_keys(vertices, origin - lowest) for origin, vertices, _ in pieces])
     _, first, index = np.unique(keys, return_index=True, return_inverse=True)
-    positions = np.concatenate([(corners + origin.astype(np.float64)) * voxel for origin, corners, _ in pieces])
-    counts = np.cumsum([0] + [len(corners) for _, corners, _ in pieces])
+    positions = np.concatenate([(vertices + origin.astype(np.float64)) * voxel for origin, vertices, _ in pieces])
+    counts = np.cumsum([0] + [len(vertices) for _, vertices, _ in pieces])
     faces = index[np.concatenate([faces + start for (_, _, faces), start in zip(pieces, counts, strict=False)])]
     a, b, c = faces.T
     mesh = Mesh(positions[first].astype(np.float32), faces.astype(np.int32), np.zeros((len(first), 3), dtype=np.uint8))
     return mesh.select_faces((a != b) & (b != c) & (c != a))
 
 
-def _edge_keys(corners: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def _edge_keys(vertices: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Identity [V] int64 of the lattice edge on which each vertex lies: its lower corner and its axis (3 = at the
     corner itself). `offset` [3]: the block's origin from the lowest block, cells."""
-    base = np.floor(corners)
-    along = corners - base
+    base = np.floor(vertices)
+    along = vertices - base
     axis = np.where(along.max(axis=1) > 0, along.argmax(axis=1), 3)
     lattice = base.astype(np.int64) + offset
     if len(lattice) and lattice.max() >= 1 << _KEY_BITS:

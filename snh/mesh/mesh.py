@@ -91,7 +91,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         raise OutputError(f"Cannot write a mesh to {path}: the name must end in .ply or .glb.")
     vertices = mesh.vertices * _GLTF_AXES if kind == ".glb" else mesh.vertices
     shape = trimesh.Trimesh(vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-    write_atomically(path, shape.export(file_type=kind[1:]))
+    write_atomically(path, bytes(shape.export(file_type=kind[1:])))  # type: ignore[arg-type]
 
 
 def load_mesh(path: str | Path) -> Mesh:
@@ -116,9 +116,8 @@ def load_mesh(path: str | Path) -> Mesh:
 
 def from_trimesh(shape) -> Mesh:
     """A trimesh.Trimesh with its colours taken to the vertices."""
-    colors = np.asarray(
-        shape.visual.to_color().vertex_colors if hasattr(shape.visual, "to_color") else shape.visual.vertex_colors
-    )[:, :3]
+    textured = hasattr(shape.visual, "to_color")
+    colors = np.asarray((shape.visual.to_color() if textured else shape.visual).vertex_colors)[:, :3]
     return Mesh(
         np.asarray(shape.vertices, dtype=np.float32), np.asarray(shape.faces, dtype=np.int32), colors.astype(np.uint8)
     )

@@ -38,7 +38,7 @@ class RayScene:
     def __init__(self, mesh: Mesh):
         import open3d as o3d
 
-        self._tensor = o3d.core.Tensor
+        self._tensor = o3d.core.Tensor.from_numpy
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
             self._tensor(np.ascontiguousarray(mesh.vertices, dtype=np.float32)),
