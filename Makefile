@@ -14,7 +14,7 @@ CXX ?= c++
 ARGS ?=
 NATIVE_SOURCES := CMakeLists.txt setup.py $(wildcard csrc/*/*)
 FORMATTED := $(wildcard csrc/*/*.h csrc/*/*.cpp csrc/*/*.cu csrc/*/*.cuh tests/cpp/*.cpp)
-ASAN_TESTS ?= tests/test_build.py
+OP_TESTS := $(wildcard $(patsubst csrc/%,tests/test_%.py,$(wildcard csrc/*)))
 export PYTHON TORCH SNH_CUDA
 
 .DELETE_ON_ERROR:
@@ -27,7 +27,7 @@ demo: $(READY)
 
 test: lint
 	@echo "== tests"
-	@OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --maxprocesses 8 $(ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --maxprocesses 8 --dist loadfile $(ARGS)
 
 lint: $(READY)
 	@echo "== lint: ruff, clang-format, mypy, import layers"
@@ -45,7 +45,7 @@ asan: $(READY)
 	  $(BIN)/python setup.py --quiet build --build-base build/asan --build-lib build/asan/lib
 	@LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so.6)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH=build/asan/lib OMP_NUM_THREADS=1 \
-	  $(BIN)/pytest -n auto --maxprocesses 8 $(ASAN_TESTS) $(ARGS)
+	  $(BIN)/pytest -n auto --maxprocesses 8 --dist loadfile $(OP_TESTS) $(ARGS)
 
 build: $(VENV)/.requirements
 	@$(BIN)/python setup.py --quiet build_ext --inplace
