@@ -59,6 +59,7 @@ def run(command: list[str]) -> None:
     """Runs CMake; what CMakeLists.txt itself refuses becomes our one sentence, anything else keeps its own message."""
     result = subprocess.run(command, stderr=subprocess.PIPE, text=True)
     if result.returncode == 0:
+        sys.stderr.write(result.stderr)
         return
     refusal = re.search(r"SNH: (.+?)\n\n", result.stderr, re.DOTALL)
     if refusal:
@@ -73,10 +74,9 @@ class CMakeBuild(build_ext):
         cmake, ninja = tool("cmake"), tool("ninja")
         build = Path(os.environ.get("SNH_BUILD") or ROOT / "build" / f"native-{sys.implementation.cache_tag}")
         run([
-            cmake, "-S", str(ROOT), "-B", str(build), "-G", "Ninja",
+            cmake, "-S", str(ROOT), "-B", str(build), "-G", "Ninja", "--log-level=NOTICE",
             f"-DCMAKE_MAKE_PROGRAM={ninja}",
             f"-DPython3_EXECUTABLE={sys.executable}",
-            f"-DPython_EXECUTABLE={sys.executable}",
             f"-DSNH_CUDA={CUDA}",
             f"-DSNH_SANITIZE={os.environ.get('SNH_SANITIZE', '')}",
             *shlex.split(os.environ.get("CMAKE_ARGS", "")),
