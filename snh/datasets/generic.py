@@ -43,7 +43,8 @@ def _from_lists(folder: Path) -> list[tuple[Path, Path]]:
     color, depth = _read_list(folder / "color.txt"), _read_list(folder / "depth.txt")
     if len(color) != len(depth) or not color:
         raise DataError(
-            f"{folder} lists {len(color)} colour and {len(depth)} depth images; list the same number, pairs on the same line"
+            f"{folder} lists {len(color)} colour and {len(depth)} depth images; "
+            "list as many of each, the images of a pair on the same line"
         )
     return list(zip(color, depth, strict=True))
 

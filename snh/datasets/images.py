@@ -24,7 +24,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with path.open("rb") as file:
             head = file.read(65536)
-            file.seek(max(len(head) - _TAIL, path.stat().st_size - _TAIL))
+            file.seek(max(0, file.seek(0, 2) - _TAIL))
             tail = file.read()
     except OSError as error:
         raise _unreadable(path, error) from error

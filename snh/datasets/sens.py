@@ -87,9 +87,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[Calibration, tuple[int, in
             f"{path} has .sens version {version}, but only {_VERSION} is known; export it with ScanNet's tools"
         )
     file.seek(name_bytes, 1)
-    matrices = np.frombuffer(file.read(4 * 64), "<f4").reshape(-1, 4, 4).astype(float)
-    if len(matrices) < 4:
-        raise struct.error("no room for the header")
+    matrices = np.reshape(struct.unpack("<64f", file.read(256)), (4, 4, 4))
     # The extrinsics (1 and 3) are identity in ScanNet: both cameras count as being at one place.
     color, depth = matrices[0], matrices[2]
     compressions = struct.unpack("<ii", file.read(8))
@@ -113,7 +111,7 @@ def _read_index(file: BinaryIO, count: int) -> list[_Entry]:
     file.seek(start)
     entries = []
     for number in range(count):
-        T_wc = np.frombuffer(file.read(64), "<f4").astype(float)
+        T_wc = np.array(struct.unpack("<16f", file.read(64)))
         microseconds, _, color_bytes, depth_bytes = struct.unpack("<QQQQ", file.read(32))
         offset = file.tell()
         if offset + color_bytes + depth_bytes > end:

@@ -99,4 +99,4 @@ def _reference(path: Path, times: list[float], max_difference: float) -> np.ndar
     gaps = np.abs(pose_times[None] - np.array(times)[:, None])
     nearest = gaps.argmin(axis=1)
     near = gaps[np.arange(len(times)), nearest] <= max_difference
-    return pick_rows(poses, np.where(near, nearest, -1))
+    return pick_rows(poses, np.where(near, nearest, -1).tolist())
