@@ -647,6 +647,8 @@ class CountingSequence:
         self.threads.add(threading.current_thread().name)
         if index == 3:
             raise FrameError("frame 3 is damaged", 3)
+        if index >= len(self):
+            raise IndexError(index)
         return Frame(index, 0.0, np.zeros((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32), CAMERA)
 
     def reference(self) -> None:
@@ -661,54 +663,53 @@ def wait_until(condition: Callable[[], bool]) -> None:
     raise AssertionError("waited 5 s in vain")
 
 
-def test_prefetch_order_and_error_at_its_frame() -> None:
+def test_prefetch_order_and_damaged_frame_in_its_place() -> None:
     sequence = CountingSequence()
-    frames = prefetch(sequence, range(6))
-    got: list[int] = []
-    while True:
-        try:
-            got.append(next(frames).index)
-        except FrameError as error:
-            got.append(-error.index)
-        except StopIteration:
-            break
-    assert got == [0, 1, 2, -3, 4, 5]
+    items = list(prefetch(sequence, range(6)))
+    assert [item.index for item in items] == [0, 1, 2, 3, 4, 5]
+    assert [isinstance(item, FrameError) for item in items] == [False, False, False, True, False, False]
     assert threading.current_thread().name not in sequence.threads
+
+
+def test_prefetch_raises_other_errors_at_their_frame() -> None:
+    frames = prefetch(CountingSequence(), [0, 1, 99, 2])
+    assert [next(frames).index, next(frames).index] == [0, 1]
+    with pytest.raises(IndexError):
+        next(frames)
 
 
 def test_prefetch_runs_ahead_and_no_further() -> None:
     sequence = CountingSequence()
-    with prefetch(sequence, [9, 8, 7, 6, 5, 4], ahead=2) as frames:
-        wait_until(lambda: len(sequence.asked) == 2)
-        time.sleep(0.05)
-        assert sequence.asked == [9, 8]
-        assert next(frames).index == 9
-        wait_until(lambda: sequence.asked == [9, 8, 7])
+    frames = prefetch(sequence, [9, 8, 7, 6, 5, 4], ahead=2)
+    assert next(frames).index == 9
+    wait_until(lambda: len(sequence.asked) == 3)
+    time.sleep(0.05)
+    assert sequence.asked == [9, 8, 7]
+    assert next(frames).index == 8
+    wait_until(lambda: sequence.asked == [9, 8, 7, 6])
 
 
-@pytest.mark.parametrize("way", ["close", "with", "end", "forget"])
+@pytest.mark.parametrize("way", ["close", "end", "forget", "error"])
 def test_prefetch_stops_its_thread(way: str) -> None:
     before = threading.active_count()
-    frames = prefetch(CountingSequence(), [0, 1, 2])
+    frames = prefetch(CountingSequence(), [0, 1, 2, 99] if way == "error" else [0, 1, 2])
     assert next(frames).index == 0
+    assert threading.active_count() == before + 1
     if way == "close":
-        frames.close()
-    elif way == "with":
-        with frames:
-            pass
+        frames.close()  # type: ignore[attr-defined]
     elif way == "end":
         assert [frame.index for frame in frames] == [1, 2]
+    elif way == "error":
+        with pytest.raises(IndexError):
+            list(frames)
     else:
         del frames
-    wait_until(lambda: threading.active_count() == before)
-    if way in ("close", "with"):
-        with pytest.raises(StopIteration):
-            next(frames)
+    assert threading.active_count() == before
 
 
 def test_prefetch_of_files(tmp_path: Path) -> None:
     shots = make_shots(6)
     sequence = open_sequence(write_7scenes(tmp_path / "r", shots))
-    with prefetch(sequence, range(6)) as frames:
-        for frame, shot in zip(frames, shots, strict=True):
-            assert_frame(frame, shot)
+    for frame, shot in zip(prefetch(sequence, range(6)), shots, strict=True):
+        assert isinstance(frame, Frame)
+        assert_frame(frame, shot)
