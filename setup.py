@@ -21,6 +21,7 @@ from setuptools.command.build_ext import build_ext
 
 ROOT = Path(__file__).resolve().parent
 OLDEST_TORCH = (2, 10)
+CUDA = os.environ.get("SNH_CUDA") or "auto"
 
 
 def stop(reason: str) -> NoReturn:
@@ -50,14 +51,15 @@ def check_requirements() -> None:
     compilers = [os.environ["CXX"].split()[0]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     if not any(shutil.which(compiler) for compiler in compilers):
         stop(f"the C++ compiler '{compilers[0]}' is missing; run: sudo apt-get install g++")
-    if os.environ.get("SNH_CUDA", "auto") not in ("auto", "on", "off"):
-        stop(f"SNH_CUDA={os.environ['SNH_CUDA']} is none of auto, on, off; run: export SNH_CUDA=auto")
+    if CUDA not in ("auto", "on", "off"):
+        stop(f"SNH_CUDA={CUDA} is none of auto, on, off; run: export SNH_CUDA=auto")
 
 
 def run(command: list[str]) -> None:
     """Runs CMake; what CMakeLists.txt itself refuses becomes our one sentence, anything else keeps its own message."""
     result = subprocess.run(command, stderr=subprocess.PIPE, text=True)
     if result.returncode == 0:
+        sys.stderr.write(result.stderr)
         return
     refusal = re.search(r"SNH: (.+?)\n\n", result.stderr, re.DOTALL)
     if refusal:
@@ -72,11 +74,10 @@ class CMakeBuild(build_ext):
         cmake, ninja = tool("cmake"), tool("ninja")
         build = Path(os.environ.get("SNH_BUILD") or ROOT / "build" / f"native-{sys.implementation.cache_tag}")
         run([
-            cmake, "-S", str(ROOT), "-B", str(build), "-G", "Ninja",
+            cmake, "-S", str(ROOT), "-B", str(build), "-G", "Ninja", "--log-level=NOTICE",
             f"-DCMAKE_MAKE_PROGRAM={ninja}",
             f"-DPython3_EXECUTABLE={sys.executable}",
-            f"-DPython_EXECUTABLE={sys.executable}",
-            f"-DSNH_CUDA={os.environ.get('SNH_CUDA', 'auto')}",
+            f"-DSNH_CUDA={CUDA}",
             f"-DSNH_SANITIZE={os.environ.get('SNH_SANITIZE', '')}",
             *shlex.split(os.environ.get("CMAKE_ARGS", "")),
         ])  # fmt: skip

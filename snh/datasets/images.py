@@ -24,11 +24,11 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with path.open("rb") as file:
             head = file.read(65536)
-            file.seek(max(len(head) - _TAIL, path.stat().st_size - _TAIL))
+            file.seek(max(0, file.seek(0, 2) - _TAIL))
             tail = file.read()
     except OSError as error:
         raise _unreadable(path, error) from error
-    _check_end(path, head, tail)
+    _check_end(str(path), head, tail)
     return _size(path, head)
 
 
@@ -44,17 +44,13 @@ def read_depth(path: Path) -> np.ndarray:
 
 def decode_color(data: bytes, where: str) -> np.ndarray:
     """Colour image [H, W, 3] uint8 RGB of an encoded PNG or JPEG. A rotation in the file's notes is ignored."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise DataError(f"{where} cannot be decoded as an image; {_ADVICE}")
+    image = _decode(data, where, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def decode_depth(data: bytes, where: str) -> np.ndarray:
     """Raw depth image [H, W] uint16 of an encoded PNG."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise DataError(f"{where} cannot be decoded as an image; {_ADVICE}")
+    image = _decode(data, where, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         kind = f"{image.dtype.itemsize * 8}-bit with {1 if image.ndim == 2 else image.shape[2]} channels"
         raise DataError(f"{where} is {kind}, but depth must be a 16-bit PNG with one channel; export the raw depth")
@@ -71,29 +67,35 @@ def depth_in_metres(raw: np.ndarray, scale: float) -> np.ndarray:
 
 def _read(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise _unreadable(path, error) from error
-    _check_end(path, data[:16], data[-_TAIL:])
+
+
+def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
+    _check_end(where, data[:16], data[-_TAIL:])
     if data.startswith(_PNG_START):
-        _check_png(path, data)
-    return data
+        _check_png(where, data)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise DataError(f"{where} cannot be decoded as an image; {_ADVICE}")
+    return image
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     return DataError(f"{path} cannot be read ({error.strerror}); {_ADVICE}")
 
 
-def _check_end(path: Path, head: bytes, tail: bytes) -> None:
+def _check_end(where: str, head: bytes, tail: bytes) -> None:
     if not head:
-        raise DataError(f"{path} is empty; {_ADVICE}")
+        raise DataError(f"{where} is empty; {_ADVICE}")
     if not head.startswith((_PNG_START, _JPEG_START)):
-        raise DataError(f"{path} is neither PNG nor JPEG; convert it")
+        raise DataError(f"{where} is neither PNG nor JPEG; convert it")
     if (b"IEND" if head.startswith(_PNG_START) else _JPEG_END) not in tail:
-        raise DataError(f"{path} is truncated; {_ADVICE}")
+        raise DataError(f"{where} is truncated; {_ADVICE}")
 
 
-def _check_png(path: Path, data: bytes) -> None:
+def _check_png(where: str, data: bytes) -> None:
     """Checks the length and the checksum of each chunk."""
     at = len(_PNG_START)
     while at + 12 <= len(data):
@@ -104,7 +106,7 @@ def _check_png(path: Path, data: bytes) -> None:
         if kind == b"IEND":
             return
         at += 12 + length
-    raise DataError(f"{path} is damaged (wrong checksum); {_ADVICE}")
+    raise DataError(f"{where} is damaged (wrong checksum); {_ADVICE}")
 
 
 def _size(path: Path, head: bytes) -> tuple[int, int]:

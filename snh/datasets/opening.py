@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence as AbstractSequence
 from pathlib import Path
 
-from snh.datasets import replica, seven_scenes
+from snh.datasets import generic, replica, scannet, seven_scenes, tum
 from snh.datasets.recording import ReaderOptions
+from snh.datasets.sens import SensSequence
 from snh.datasets.sequence import Sequence, View, make_view
 from snh.errors import ConfigError, DataError
 
-FORMATS = {"7scenes": seven_scenes, "replica": replica}
+# In the order in which they are tried: the later ones ask for less.
+FORMATS = {"7scenes": seven_scenes, "replica": replica, "tum": tum, "scannet": scannet, "generic": generic}
 
 
 def open_sequence(
@@ -43,8 +45,10 @@ def _open(source: str | Path, format: str, options: ReaderOptions) -> Sequence:
     folder = Path(source)
     if not folder.exists():
         raise DataError(f"{folder} does not exist; give the folder of a recording, or builtin")
+    if folder.suffix == ".sens" and folder.is_file():
+        return SensSequence(folder, options)
     if not folder.is_dir():
-        raise DataError(f"{folder} is not a folder; give the folder of a recording")
+        raise DataError(f"{folder} is neither a folder nor a .sens file; give the folder of a recording")
     if next(folder.iterdir(), None) is None:
         raise DataError(f"{folder} is empty; give the folder that holds the images of a recording")
     if format != "auto":

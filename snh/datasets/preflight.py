@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from snh.datasets.images import image_size
 from snh.datasets.recording import wrong_size
-from snh.datasets.sequence import Sequence, View
+from snh.datasets.sequence import Sequence, View, image_files
 from snh.errors import DataError
 from snh.frame import Frame
 
@@ -24,8 +24,7 @@ def check(sequence: Sequence) -> None:
     """
     if len(sequence) < 2:
         raise DataError(f"{sequence.name} gives a single frame, from which no motion follows; use at least two frames")
-    if isinstance(sequence, View):
-        _check_files([sequence.files(i) for i in range(len(sequence))])
+    _check_files(image_files(sequence, i) for i in range(len(sequence)))
     unlimited = sequence.without_limit() if isinstance(sequence, View) else sequence
     for index in sorted({0, len(sequence) // 2, len(sequence) - 1}):
         _check_depth(sequence.name, unlimited[index])
@@ -33,7 +32,7 @@ def check(sequence: Sequence) -> None:
         raise DataError(f"no depth of the first frame of {sequence.name} is nearer than depth_max; raise it")
 
 
-def _check_files(files: AbstractSequence[AbstractSequence[Path]]) -> None:
+def _check_files(files: Iterable[Iterable[Path]]) -> None:
     """All images readable to the end, all colour images of one size and all depth images of one size."""
     expected: list[tuple[int, int]] = []
     for frame in files:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +16,8 @@ from snh.datasets.registration import Registration, make_registration
 from snh.datasets.sequence import FrameError
 from snh.errors import DataError
 from snh.frame import Camera, Frame
+
+Key = TypeVar("Key", int, float, str)
 
 FRAME_RATE = 30.0  # Hz, for layouts without timestamps
 
@@ -29,8 +33,9 @@ class ReaderOptions:
 
     def scale(self, calibration: Calibration, default: float) -> float:
         """Depth units per metre: the option, else the calibration file's, else that of the layout."""
-        scale = self.depth_scale or calibration.depth_scale or default
-        if not scale > 0:
+        given = (self.depth_scale, calibration.depth_scale, default)
+        scale = next(value for value in given if value is not None)
+        if not 0 < scale < math.inf:
             raise DataError(
                 f"depth_scale {scale} must be a positive number of units per metre, as 1000 for millimetres"
             )
@@ -113,11 +118,20 @@ def wrong_size(path: Path, size: Sequence[int], expected: Sequence[int]) -> Data
     )
 
 
-def pair_by_number(color: Mapping[int, Path], depth: Mapping[int, Path], folder: Path) -> list[int]:
-    """Sorted numbers of the frames that both mappings hold; raises DataError if one has what the other lacks."""
+def numbered_files(folder: Path, prefix: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files prefix<number><suffix> of a folder by their number; empty if there is no such folder."""
+    return {
+        int(path.stem[len(prefix) :]): path
+        for path in folder.glob(f"{prefix}*")
+        if path.suffix.lower() in suffixes and path.stem[len(prefix) :].isdigit()
+    }
+
+
+def pair_by_key(color: Mapping[Key, Path], depth: Mapping[Key, Path], folder: Path) -> list[Key]:
+    """Sorted keys of the frames that both mappings hold; raises DataError if one has what the other lacks."""
     if not color and not depth:
         raise DataError(f"{folder} holds no frames; choose the folder that holds the images")
-    for number in sorted(set(color) ^ set(depth)):
-        there, missing = (color[number], "depth") if number in color else (depth[number], "colour")
+    for key in sorted(set(color) ^ set(depth)):
+        there, missing = (color[key], "depth") if key in color else (depth[key], "colour")
         raise DataError(f"{there} has no {missing} image of the same number; add it, or remove the file")
     return sorted(color)

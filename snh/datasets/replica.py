@@ -7,7 +7,7 @@ from pathlib import Path
 
 from snh.datasets.calibration import require_calibration
 from snh.datasets.poses import pick_rows, read_matrices
-from snh.datasets.recording import FRAME_RATE, Pair, ReaderOptions, Recording, pair_by_number
+from snh.datasets.recording import FRAME_RATE, Pair, ReaderOptions, Recording, numbered_files, pair_by_key
 from snh.datasets.sequence import Sequence
 
 LAYOUT = "results/frame*.jpg|png with results/depth*.png (Replica)"
@@ -23,20 +23,11 @@ def matches(folder: Path) -> bool:
 def open_folder(folder: Path, options: ReaderOptions) -> Sequence:
     """The recording in a folder of this layout. Line n of traj.txt belongs to the frame with number n."""
     results = folder / "results"
-    color = _numbered(results, "frame", (".jpg", ".jpeg", ".png"))
-    depth = _numbered(results, "depth", (".png",))
-    numbers = pair_by_number(color, depth, results)
+    color = numbered_files(results, "frame", (".jpg", ".jpeg", ".png"))
+    depth = numbered_files(results, "depth", (".png",))
+    numbers = pair_by_key(color, depth, results)
     pairs = [Pair(color[n], depth[n], n / FRAME_RATE) for n in numbers]
     trajectory = folder / "traj.txt"
     poses = pick_rows(read_matrices(trajectory), numbers) if trajectory.is_file() else None
     calibration = require_calibration(folder, options.intrinsics)
     return Recording(folder.resolve().name, pairs, calibration, options.scale(calibration, _DEPTH_SCALE), poses)
-
-
-def _numbered(folder: Path, prefix: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Files prefix<number><suffix> of a folder by their number."""
-    return {
-        int(path.stem[len(prefix) :]): path
-        for path in folder.glob(f"{prefix}*")
-        if path.suffix.lower() in suffixes and path.stem[len(prefix) :].isdigit()
-    }

@@ -94,12 +94,17 @@ class View:
 
     def files(self, index: int) -> AbstractSequence[Path]:
         """Image files that frame `index` is read from: (colour, depth), or none."""
-        files = getattr(self.source, "files", None)
-        return files(self.indices[index]) if files else ()
+        return image_files(self.source, self.indices[index])
 
     def without_limit(self) -> View:
         """The same frames with readings at any distance."""
         return replace(self, depth_max=math.inf)
+
+
+def image_files(sequence: Sequence, index: int) -> AbstractSequence[Path]:
+    """The files that a frame is read from, none for sequences that are not made of files."""
+    files = getattr(sequence, "files", None)
+    return files(index) if files else ()
 
 
 def select_frames(sequence: Sequence, start: int, frames: int | None, stride: int) -> range:

@@ -15,7 +15,7 @@ import numpy as np
 
 from snh.datasets.calibration import Calibration, Intrinsics, require_calibration
 from snh.datasets.poses import read_matrix_files
-from snh.datasets.recording import FRAME_RATE, Pair, ReaderOptions, Recording, pair_by_number
+from snh.datasets.recording import FRAME_RATE, Pair, ReaderOptions, Recording, pair_by_key
 from snh.datasets.sequence import Sequence
 
 LAYOUT = "frame-*.color.jpg|png with frame-*.depth.png (7-Scenes)"
@@ -28,7 +28,7 @@ _NAME = re.compile(r"frame-(\d+)\.(color|depth)\.(jpg|jpeg|png)")
 
 def matches(folder: Path) -> bool:
     """Whether the folder has this layout."""
-    return next(folder.glob("frame-*.color.*"), None) is not None
+    return any(next(folder.glob(f"frame-*.{kind}.*"), None) for kind in ("color", "depth"))
 
 
 def open_folder(folder: Path, options: ReaderOptions) -> Sequence:
@@ -37,7 +37,7 @@ def open_folder(folder: Path, options: ReaderOptions) -> Sequence:
     for path in folder.iterdir():
         if match := _NAME.fullmatch(path.name):
             found[match[2]][int(match[1])] = path
-    numbers = pair_by_number(found["color"], found["depth"], folder)
+    numbers = pair_by_key(found["color"], found["depth"], folder)
     pairs = [Pair(found["color"][n], found["depth"][n], n / FRAME_RATE) for n in numbers]
     poses = read_matrix_files(
         pair.depth.with_name(pair.depth.name.replace(".depth.png", ".pose.txt")) for pair in pairs

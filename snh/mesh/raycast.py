@@ -1,0 +1,66 @@
+"""Rays against a mesh, on the CPU and without a window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from snh.frame import Camera
+from snh.mesh.mesh import Mesh
+
+
+def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Pose [4, 4], camera to world, of a camera at `center` that looks at `target` with `up` ([3]) upwards."""
+    forward = np.asarray(target, dtype=np.float64) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    T[:3, 3] = center
+    return T
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First hits of rays, shape [...] of the rays: t along the direction (inf = none), face index (-1 = none),
+    weights [..., 3] of the face's corners."""
+
+    t: np.ndarray
+    face: np.ndarray
+    weights: np.ndarray
+
+
+class RayScene:
+    """A mesh made ready for ray casting and distance queries."""
+
+    def __init__(self, mesh: Mesh):
+        import open3d as o3d
+
+        self._tensor = o3d.core.Tensor.from_numpy
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(mesh.vertices, dtype=np.float32)),
+            self._tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)),
+        )
+
+    def cast(self, rays_o: np.ndarray, rays_d: np.ndarray) -> Hits:
+        """First hits of the rays from rays_o ([..., 3] or [3]) along rays_d [..., 3], float32."""
+        rays = np.empty((*rays_d.shape[:-1], 6), dtype=np.float32)
+        rays[..., :3], rays[..., 3:] = rays_o, rays_d
+        answer = self._scene.cast_rays(self._tensor(rays))
+        uv = answer["primitive_uvs"].numpy()
+        t = answer["t_hit"].numpy()
+        face = np.where(np.isfinite(t), answer["primitive_ids"].numpy().astype(np.int64), -1)
+        return Hits(t, face, np.concatenate([1 - uv.sum(axis=-1, keepdims=True), uv], axis=-1))
+
+    def depth(self, camera: Camera, T_wc: np.ndarray) -> np.ndarray:
+        """z-depth [H, W] float32 m that the camera at T_wc [4, 4] sees; 0 where it sees nothing."""
+        directions = camera.rays() @ T_wc[:3, :3].T
+        t = self.cast(T_wc[:3, 3], directions).t  # z = 1 in the camera frame, so t is the depth
+        return np.where(np.isfinite(t), t, 0).astype(np.float32)
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Exact distance of points [N, 3] to the nearest point of the surface, [N] float32 m."""
+        return self._scene.compute_distance(self._tensor(np.ascontiguousarray(points, dtype=np.float32))).numpy()

@@ -1,0 +1,227 @@
+"""field: the plain implementation in float64 equals the oracle, the fast ones in float32 equal the plain one."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import reference
+import reference_field
+import torch
+
+from snh.ops.field import FieldSpec, field_map, field_map_, field_query, field_track
+from snh.ops.hash_table import HashTable
+
+N_BASE, N_SURFACE, NEAR, FAR = 5, 4, 0.01, 1.2
+LAMBDAS = (5.0, 0.1, 10.0, 1000.0)
+SPEC = FieldSpec(cell_sizes=(0.05, 0.13, 0.4), n_octaves=3, hidden=16, n_geometry=7, base_wavelength=4.0)
+
+
+@dataclass
+class Scene:
+    spec: FieldSpec
+    table: HashTable
+    slots: dict  # (level, plane, i, j) -> row, for the oracle
+    features: torch.Tensor
+    decoder: torch.Tensor
+
+    def to(self, dtype):
+        return Scene(self.spec, self.table, self.slots, self.features.to(dtype), self.decoder.to(dtype))
+
+
+def make_scene(spec=SPEC, seed=0, box=((-1.0, -1.2, 0.2), (1.1, 0.9, 1.9)), missing=0.02) -> Scene:
+    """A map of every vertex in a box, m, but for a random share of `missing` ones; float64."""
+    generator = torch.Generator().manual_seed(seed)
+    vertices = []
+    for level, cell in enumerate(spec.cell_sizes):
+        for plane, axes in enumerate(reference_field.AXES):
+            u, v = (torch.arange(int(box[0][a] // cell), int(box[1][a] // cell) + 2) for a in axes)
+            ij = torch.cartesian_prod(u, v)
+            ij = ij[torch.rand(len(ij), generator=generator) >= missing]
+            vertices += [(level, plane, i, j) for i, j in ij.tolist()]
+    masks = reference.brick_masks(vertices)
+    table = HashTable()
+    table.insert(torch.tensor(list(masks)), torch.tensor([reference.signed(mask) for mask in masks.values()]))
+    slots = dict(zip(vertices, table.find(torch.tensor(vertices)).tolist(), strict=True))
+    features = torch.zeros(table.n_bricks * 64, 4, dtype=torch.float64)
+    rows = torch.tensor(list(slots.values()))
+    features[rows, : spec.n_features] = torch.randn(len(rows), spec.n_features, generator=generator).double()
+    decoder = 0.3 * torch.randn(spec.decoder_size, generator=generator).double()
+    return Scene(spec, table, slots, features, decoder)
+
+
+def pose(generator, centre=(0.0, 0.0, 0.0)) -> torch.Tensor:
+    twist = 0.2 * torch.randn(6, generator=generator).double()
+    T = reference_field.exp_se3(twist)
+    T[:3, 3] += torch.tensor(centre, dtype=torch.float64)
+    return T
+
+
+def make_rays(n_rays, n_samples, seed=0, n_frames=3, centre=(0.0, 0.0, 0.0)) -> dict:
+    """Rays into the box of `make_scene`, some of them out of it at the sides and behind; float64."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator).double()
+
+    return dict(
+        dirs_c=torch.cat([rand(n_rays, 2) * 2 - 1, torch.ones(n_rays, 1).double()], dim=1),
+        depth=0.6 + 1.4 * rand(n_rays),
+        color=rand(n_rays, 3),
+        frame_index=torch.randint(0, n_frames, (n_rays,), generator=generator).int(),
+        T_wc=torch.stack([pose(generator, centre) for _ in range(n_frames)]),
+        uniforms=0.01 + 0.98 * rand(n_rays, n_samples),
+    )
+
+
+def run_map(scene, rays, impl="auto", lambdas=LAMBDAS, n_base=N_BASE, n_surface=N_SURFACE) -> dict:
+    """Losses and gradients by field_map_."""
+    dtype, n_bricks = scene.features.dtype, scene.table.n_bricks
+    result = dict(
+        features=torch.zeros_like(scene.features),
+        touched=torch.zeros(n_bricks, dtype=torch.uint8),
+        decoder=torch.full_like(scene.decoder, 7.0),
+        T_wc=torch.full((len(rays["T_wc"]), 3, 4), 7.0, dtype=dtype),
+    )
+    rays = {k: v if k == "frame_index" else v.to(dtype) for k, v in rays.items()}
+    result["losses"] = field_map_(
+        *rays.values(), scene.features, scene.table, scene.decoder, scene.spec, n_base, n_surface, NEAR, FAR, lambdas,
+        *result.values(), impl=impl,
+    )  # fmt: skip
+    return result
+
+
+def run_oracle(scene, rays, lambdas=LAMBDAS, n_base=N_BASE, n_surface=N_SURFACE) -> dict:
+    leaves = dict(features=scene.features.clone(), decoder=scene.decoder.clone(), T_wc=rays["T_wc"].clone())
+    for leaf in leaves.values():
+        leaf.requires_grad_()
+    rays = {**rays, "T_wc": leaves["T_wc"]}
+    losses = reference_field.field_map(
+        *rays.values(), leaves["features"], scene.slots, leaves["decoder"], scene.spec, n_base, n_surface, NEAR, FAR
+    )
+    if len(rays["depth"]):
+        (losses @ torch.tensor(lambdas, dtype=torch.float64)).backward()
+    result = {k: leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for k, leaf in leaves.items()}
+    result["T_wc"] = result["T_wc"][:, :3]
+    result["losses"] = losses.detach()
+    result["touched"] = (result["features"].view(-1, 256) != 0).any(dim=1)
+    return result
+
+
+def assert_close(got, want, bound, name):
+    """|got - want| <= bound x the largest entry (1 if all are smaller than that)."""
+    scale = max(want.abs().max().item(), 1.0) if want.numel() else 1.0
+    error = (got.double() - want).abs().max().item() / scale if want.numel() else 0.0
+    assert error <= bound, f"{name}: error {error:.3g} of the largest entry, {bound:.3g} allowed"
+
+
+# --- the plain implementation against the oracle, float64: 1e-10 ----------------------------------------------------
+
+
+@pytest.mark.parametrize("n_rays", [0, 1, 31, 32, 33])
+def test_map_equals_oracle(n_rays):
+    scene, rays = make_scene(), make_rays(n_rays, N_BASE + N_SURFACE)
+    got, want = run_map(scene, rays, "reference"), run_oracle(scene, rays)
+    for name in ("losses", "features", "decoder", "T_wc"):
+        assert_close(got[name], want[name], 1e-10, name)
+    assert (got["touched"].bool() | ~want["touched"]).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        dict(cut_behind=True),
+        dict(n_features=4, cell_sizes=(0.1,)),
+        dict(n_features=1, n_octaves=0),
+        dict(n_geometry=0, hidden=1),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("samples", [(5, 4), (0, 3), (3, 0)])
+def test_map_variants_equal_oracle(change, samples):
+    spec = replace(SPEC, **change)
+    scene, rays = make_scene(spec), make_rays(9, sum(samples))
+    got = run_map(scene, rays, "reference", n_base=samples[0], n_surface=samples[1])
+    want = run_oracle(scene, rays, n_base=samples[0], n_surface=samples[1])
+    for name in ("losses", "features", "decoder", "T_wc"):
+        assert_close(got[name], want[name], 1e-10, name)
+
+
+@pytest.mark.parametrize("n_rays", [0, 1, 31, 32, 33])
+@pytest.mark.parametrize("n_samples", [1, 3])
+def test_track_equals_oracle(n_rays, n_samples):
+    scene, rays = make_scene(), make_rays(n_rays, n_samples)
+    arguments = rays["dirs_c"], rays["depth"], rays["T_wc"][0], rays["uniforms"], scene.features
+    got = field_track(*arguments, scene.table, scene.decoder, scene.spec, 0.08, impl="reference")
+    want = reference_field.field_track(*arguments, scene.slots, scene.decoder, scene.spec, 0.08)
+    assert_close(got[0], want[0], 1e-10, "residuals")
+    assert_close(got[1], want[1], 1e-10, "jacobian")
+    assert got[2].equal(want[2])
+    if n_rays > 1:
+        assert want[2].any() and not want[2].all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 300])
+def test_query_equals_oracle(n):
+    scene = make_scene()
+    points = torch.rand(n, 3, generator=torch.Generator().manual_seed(1)).double() * 4 - 2
+    got = field_query(points, scene.features, scene.table, scene.decoder, scene.spec, impl="reference")
+    want = reference_field.field(points, scene.features, scene.slots, scene.decoder, scene.spec)
+    assert_close(got[0], want[0], 1e-10, "tsdf")
+    assert_close(got[1], want[1], 1e-10, "color")
+    assert got[2].equal(want[2])
+    geometry = field_query(points, scene.features, scene.table, scene.decoder, scene.spec, with_color=False)
+    assert geometry[0].equal(got[0]) and geometry[1].shape == (0, 3)
+
+
+# --- the differentiable form ----------------------------------------------------------------------------------------
+
+
+def differentiable(scene, rays):
+    rays = dict(rays)
+    T_wc = rays.pop("T_wc")
+    uniforms = rays.pop("uniforms")
+
+    def losses(T_wc, features, decoder):
+        return field_map(
+            *rays.values(), T_wc, uniforms, features, scene.table, decoder, scene.spec, N_BASE, N_SURFACE, NEAR, FAR
+        )
+
+    return losses, tuple(t.clone().requires_grad_() for t in (T_wc, scene.features, scene.decoder))
+
+
+def test_gradcheck():
+    spec = FieldSpec(cell_sizes=(0.4,), n_octaves=1, hidden=4, n_geometry=2, base_wavelength=4.0)
+    scene, rays = make_scene(spec, missing=0.1), make_rays(3, N_BASE + N_SURFACE, n_frames=2)
+    losses, leaves = differentiable(scene, rays)
+    exists = (scene.features != 0).double()  # the others are constant by contract
+    assert torch.autograd.gradcheck(
+        lambda T, f, d: losses(T, f * exists, d), leaves, eps=1e-6, atol=1e-6, fast_mode=True
+    )
+
+
+def test_gradient_of_each_loss_alone():
+    scene, rays = make_scene(), make_rays(7, N_BASE + N_SURFACE)
+    for k in range(4):
+        weights = [float(k == other) for other in range(4)]
+        losses, leaves = differentiable(scene, rays)
+        (losses(*leaves) @ torch.tensor(weights).double()).backward()
+        want = run_oracle(scene, rays, lambdas=weights)
+        for name, leaf in zip(("T_wc", "features", "decoder"), leaves, strict=True):
+            grad = leaf.grad[:, :3] if name == "T_wc" else leaf.grad
+            assert_close(grad, want[name], 1e-10, f"{name} of loss {k}")
+
+
+def test_opcheck():
+    scene, rays = make_scene().to(torch.float64), make_rays(3, N_BASE + N_SURFACE)
+    T, f, d = (t.clone().requires_grad_() for t in (rays["T_wc"], scene.features, scene.decoder))
+    table = (scene.table.probe, scene.table.brick_keys, scene.table.masks)
+    rest = (*scene.spec._arguments, N_BASE, N_SURFACE, NEAR, FAR, "reference")
+    head = (rays["dirs_c"], rays["depth"], rays["color"], rays["frame_index"])
+    torch.library.opcheck(torch.ops.snh.field_map.default, (*head, T, rays["uniforms"], f, *table, d, *rest))
+    scene_arguments = (scene.features, *table, scene.decoder, *scene.spec._arguments)
+    torch.library.opcheck(
+        torch.ops.snh.field_track.default,
+        (rays["dirs_c"], rays["depth"], rays["T_wc"][0], rays["uniforms"], *scene_arguments, 0.06, "reference"),
+    )
+    torch.library.opcheck(
+        torch.ops.snh.field_query.default, (rays["dirs_c"], *scene_arguments, True, "reference"),
+    )  # fmt: skip
