@@ -8,6 +8,7 @@ import resource
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,15 +17,18 @@ import torch
 import yaml
 from tqdm import tqdm
 
-from snh.config import Config, load_config
-from snh.datasets import FrameError, Sequence, prefetch
-from snh.errors import DataError, OutputError, SNHError
-from snh.eval.trajectory import align, ate, read_tum, write_tum
+from snh import ops
+from snh.config import Config
+from snh.datasets import FrameError, Sequence, check, prefetch
+from snh.errors import DataError, OutputError
+from snh.eval.trajectory import ate, write_tum
 from snh.files import write_atomically
-from snh.geometry import inverse
-from snh.mesh import Mesh, extract_mesh
+from snh.frame import Frame
+from snh.mesh import Mesh, candidate_blocks, extract_mesh, save_mesh
+from snh.nn import SceneField
 from snh.slam import SLAM
-from snh.slam.map_file import load_map, save_map
+from snh.slam.map_file import save_map
+from snh.viz import dollhouse_view, draw_path, render_mesh, save_png, up_direction
 
 
 @dataclass
@@ -46,6 +50,7 @@ def run_sequence(
     """SLAM over a sequence; results in `out`. Returns the exit code: 0, or 130 after an interrupt."""
     if len(sequence) < 2:
         raise DataError(f"'{sequence.name}' has a single frame; SLAM needs at least two")
+    check(sequence)
     prepare_output(out)
     run = track_sequence(sequence, config, seed, threads, quiet)
     metrics, _ = save_run(run, sequence, config, out, with_mesh)
@@ -61,38 +66,51 @@ def prepare_output(out: Path) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OutputError(f"cannot write to the output folder {out}: {error.strerror}; choose another with -o") from error
+        raise OutputError(
+            f"cannot write to the output folder {out}: {error.strerror}; choose another with -o"
+        ) from error
 
 
 def track_sequence(sequence: Sequence, config: Config, seed: int, threads: int | None, quiet: bool) -> Run:
     """Tracks and maps every frame; Ctrl-C ends after the frame in work."""
     torch.set_num_threads(threads or os.cpu_count() or 1)
     run = Run(SLAM(sequence.camera, config, seed))
-    stop = _on_interrupt(run)
+    previous = _on_interrupt(run)
     bar = tqdm(total=len(sequence), unit="frame", disable=quiet, dynamic_ncols=True)
     start = time.perf_counter()
     try:
-        for item in prefetch(sequence, range(len(sequence))):
-            bar.update()
-            if isinstance(item, FrameError):
-                run.skipped[item.index] = str(item)
-                bar.write(f"frame {item.index} is skipped: {item}", file=sys.stderr)
-                continue
-            result = run.slam.step(item)
-            run.indices.append(item.index)
-            run.timestamps.append(item.timestamp)
-            if result.status == "first":
-                run.init_s = time.perf_counter() - start
-            elif result.status != "ok":
-                bar.write(f"frame {item.index}: {result.status}; " + CONSEQUENCE[result.status], file=sys.stderr)
-            bar.set_postfix_str(_state(run), refresh=False)
-            if run.interrupted:
-                break
+        with prefetch(sequence, range(len(sequence))) as frames:
+            for frame in _readable(frames, run, bar):
+                result = run.slam.step(frame)
+                run.indices.append(frame.index)
+                run.timestamps.append(frame.timestamp)
+                if result.status == "first":
+                    run.init_s = time.perf_counter() - start
+                elif result.status != "ok":
+                    bar.write(f"frame {frame.index}: {result.status}; {CONSEQUENCE[result.status]}", file=sys.stderr)
+                bar.set_postfix_str(_state(run), refresh=False)
+                if run.interrupted:
+                    break
     finally:
-        signal.signal(signal.SIGINT, stop)
+        signal.signal(signal.SIGINT, previous)
         bar.close()
     run.tracking_s = time.perf_counter() - start - run.init_s
     return run
+
+
+def _readable(frames: prefetch, run: Run, bar: tqdm) -> Iterator[Frame]:
+    """The frames that can be read; a damaged one is said and skipped."""
+    while True:
+        try:
+            frame = next(frames)
+        except StopIteration:
+            return
+        except FrameError as error:
+            run.skipped[error.index] = str(error)
+            bar.write(f"frame {error.index} is skipped: {error}", file=sys.stderr)
+        else:
+            yield frame
+        bar.update()
 
 
 CONSEQUENCE = {
@@ -120,58 +138,82 @@ def _state(run: Run) -> str:
 
 def save_run(run: Run, sequence: Sequence, config: Config, out: Path, with_mesh: bool) -> tuple[dict, Mesh | None]:
     """Writes every result of a run to `out`; each file is complete or absent. Returns the metrics and the mesh."""
-    from snh.viz import draw_path
-
     slam = run.slam
     T_wc = slam.trajectory()
-    write_tum(out / "trajectory.txt", run.timestamps, T_wc)
+    reference = sequence.reference()
+    T_ref = None if reference is None else reference[run.indices]
+    write_tum(out / "trajectory.txt", np.array(run.timestamps), T_wc)
     write_atomically(out / "config.yaml", yaml.safe_dump(config.to_dict(), sort_keys=False).encode())
     write_atomically(out / "frames.csv", _frame_table(run).encode())
     save_map(out / "map.npz", slam, config)
-
-    reference = sequence.reference()
-    T_ref = None if reference is None else reference[run.indices]
     metrics = measure(run, T_wc, T_ref)
-    write_atomically(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+    write_metrics(out, metrics)
     draw_path(out / "path.png", T_wc, T_ref)
 
     mesh = None
     if with_mesh:
-        mesh = extract_mesh(slam.field, config.mesh.voxel)
-        mesh.save(out / "mesh.ply")
-        mesh.save(out / "mesh.glb")
-        draw_mesh(mesh, T_wc, slam.camera, out)
-    metrics["peak_rss_mb"] = _peak_rss_mb()
-    write_atomically(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+        mesh = mesh_of(slam.field, config.mesh.voxel)
+        save_mesh(mesh, out / "mesh.ply")
+        save_mesh(mesh, out / "mesh.glb")
+        draw_mesh(out / "mesh.png", mesh, T_wc)
+        metrics["peak_rss_mb"] = peak_rss_mb()
+        write_metrics(out, metrics)
     return metrics, mesh
+
+
+def write_metrics(out: Path, metrics: dict) -> None:
+    write_atomically(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
+
+
+def mesh_of(field: SceneField, voxel: float) -> Mesh:
+    """The coloured surface of a field, everywhere its planes reach."""
+    spec, table = field.spec, field.table
+
+    def query(points: np.ndarray, with_color: bool):
+        return ops.field_query(
+            torch.from_numpy(points), field.features.detach(), table, field.decoder.weight.detach(), spec, with_color
+        )
+
+    blocks = candidate_blocks(table.brick_keys.numpy(), spec.cell_sizes[0], voxel)
+    return extract_mesh(query, blocks, voxel, spec.truncation)
+
+
+def draw_mesh(path: Path, mesh: Mesh, T_wc: np.ndarray) -> None:
+    """The room from above and outside, walls towards the viewer left out."""
+    if len(mesh.faces) == 0:
+        return
+    view = dollhouse_view(mesh, up_direction(mesh, T_wc))
+    save_png(path, render_mesh(mesh, view.camera, view.T_wc, cull_back_faces=True))
 
 
 def measure(run: Run, T_wc: np.ndarray, T_ref: np.ndarray | None) -> dict:
     """The figures of a run; `ate_rmse_cm` is null without reference poses."""
     results, encoding = run.slam.results, run.slam.field.encoding
-    error = None if T_ref is None else ate(T_wc, T_ref)
+    has_reference = T_ref is not None and np.isfinite(T_ref).all(axis=(1, 2)).any()
+    error = ate(T_wc, T_ref) if has_reference else None
     statuses = [r.status for r in results]
+    residuals = [r.residual_cm for r in results if r.status == "ok"]
     return {
         "frames": len(results),
         "fps": (len(results) - 1) / run.tracking_s if len(results) > 1 else None,
         "init_s": run.init_s,
-        "ate_rmse_cm": None if error is None else error.rmse_cm,
-        "ate_max_cm": None if error is None else error.max_cm,
-        "ate_frames": None if error is None else error.n_frames,
+        "ate_rmse_cm": error and error.rmse_cm,
+        "ate_max_cm": error and error.max_cm,
+        "ate_frames": error and int(np.isfinite(error.errors_cm).sum()),
         "map_bytes_occupied": encoding.memory_bytes(occupied=True),
         "map_bytes_held": encoding.memory_bytes(occupied=False),
-        "peak_rss_mb": _peak_rss_mb(),
+        "peak_rss_mb": peak_rss_mb(),
         "n_keyframes": len(run.slam.keyframes),
+        "residual_cm": float(np.median(residuals)) if residuals else None,
         "frames_lost": statuses.count("lost"),
         "frames_without_depth": statuses.count("no depth"),
         "frames_without_colour": statuses.count("no colour"),
         "frames_unreadable": len(run.skipped),
-        "residual_cm": float(np.nanmedian([r.residual_cm for r in results[1:]])) if len(results) > 1 else None,
         "interrupted": run.interrupted,
     }
 
 
-def _peak_rss_mb() -> float:
+def peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -188,17 +230,25 @@ def _frame_table(run: Run) -> str:
 
 def summary(metrics: dict, out: Path) -> str:
     """The table at the end of a run."""
-    rows = [
-        ("frames", f"{metrics['frames']} ({metrics['n_keyframes']} keyframes)"),
-        ("speed", "-" if metrics["fps"] is None else f"{metrics['fps']:.1f} frames/s, first frame {metrics['init_s']:.1f} s"),
-        ("map", f"{metrics['map_bytes_occupied'] / 1e6:.2f} MB occupied, {metrics['map_bytes_held'] / 1e6:.2f} MB held"),
-        ("peak memory", f"{metrics['peak_rss_mb']:.0f} MB"),
-    ]  # fmt: skip
+    rows = [("frames", f"{metrics['frames']} ({metrics['n_keyframes']} keyframes)")]
     if metrics["ate_rmse_cm"] is not None:
-        rows.insert(1, ("ATE RMSE", f"{metrics['ate_rmse_cm']:.2f} cm over {metrics['ate_frames']} frames"))
-    rows += [(name.replace("_", " "), f"{metrics[name]:.2f}") for name in RECONSTRUCTION if name in metrics]
+        rows.append(("ATE RMSE", f"{metrics['ate_rmse_cm']:.2f} cm over {metrics['ate_frames']} frames"))
+    rows += [(label, f"{metrics[key]:.2f}{unit}") for key, label, unit in RECONSTRUCTION if key in metrics]
+    if metrics["fps"] is not None:
+        rows.append(("speed", f"{metrics['fps']:.1f} frames/s, first frame {metrics['init_s']:.1f} s"))
+    occupied, held = metrics["map_bytes_occupied"] / 1e6, metrics["map_bytes_held"] / 1e6
+    rows.append(("map", f"{occupied:.2f} MB occupied, {held:.2f} MB held"))
+    rows.append(("peak memory", f"{metrics['peak_rss_mb']:.0f} MB"))
+    rows += [
+        (key.replace("_", " "), str(metrics[key])) for key in metrics if key.startswith("frames_") and metrics[key]
+    ]
     width = max(len(name) for name, _ in rows)
     return "\n".join([f"  {name:<{width}}  {value}" for name, value in rows] + [f"  results in {out}"])
 
 
-RECONSTRUCTION = ("accuracy_cm", "completion_cm", "completion_ratio_5cm_pct", "depth_l1_cm")
+RECONSTRUCTION = (
+    ("accuracy_cm", "accuracy", " cm"),
+    ("completion_cm", "completion", " cm"),
+    ("completion_ratio_5cm_pct", "completion ratio (5 cm)", " %"),
+    ("depth_l1_cm", "depth L1", " cm"),
+)
