@@ -61,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run_options(parser: argparse.ArgumentParser, out: str | None = None, frames: int | None = None) -> None:
     parser.add_argument("-c", "--config", action="append", default=[], metavar="PRESET",
-                        help="preset or YAML file (default: fast); may be given several times, later ones win")  # fmt: skip
+                        help="preset or YAML file (default: fast); may be repeated, later ones win")  # fmt: skip
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE",
                         help="one setting, for example --set tracking.n_rays=512")  # fmt: skip
     parser.add_argument("-n", "--frames", type=int, default=frames, help="use at most this many frames")

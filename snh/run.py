@@ -8,7 +8,6 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from snh.datasets import FrameError, Sequence, check, prefetch
 from snh.errors import DataError, OutputError
 from snh.eval.trajectory import ate, write_tum
 from snh.files import write_atomically
-from snh.frame import Frame
 from snh.mesh import Mesh, candidate_blocks, extract_mesh, save_mesh
 from snh.nn import SceneField
 from snh.slam import SLAM
@@ -79,38 +77,27 @@ def track_sequence(sequence: Sequence, config: Config, seed: int, threads: int |
     bar = tqdm(total=len(sequence), unit="frame", disable=quiet, dynamic_ncols=True)
     start = time.perf_counter()
     try:
-        with prefetch(sequence, range(len(sequence))) as frames:
-            for frame in _readable(frames, run, bar):
-                result = run.slam.step(frame)
-                run.indices.append(frame.index)
-                run.timestamps.append(frame.timestamp)
-                if result.status == "first":
-                    run.init_s = time.perf_counter() - start
-                elif result.status != "ok":
-                    bar.write(f"frame {frame.index}: {result.status}; {CONSEQUENCE[result.status]}", file=sys.stderr)
-                bar.set_postfix_str(_state(run), refresh=False)
-                if run.interrupted:
-                    break
+        for item in prefetch(sequence, range(len(sequence))):
+            bar.update()
+            if isinstance(item, FrameError):
+                run.skipped[item.index] = str(item)
+                bar.write(f"frame {item.index} is skipped: {item}", file=sys.stderr)
+                continue
+            result = run.slam.step(item)
+            run.indices.append(item.index)
+            run.timestamps.append(item.timestamp)
+            if result.status == "first":
+                run.init_s = time.perf_counter() - start
+            elif result.status != "ok":
+                bar.write(f"frame {item.index}: {result.status}; {CONSEQUENCE[result.status]}", file=sys.stderr)
+            bar.set_postfix_str(_state(run), refresh=False)
+            if run.interrupted:
+                break
     finally:
         signal.signal(signal.SIGINT, previous)
         bar.close()
     run.tracking_s = time.perf_counter() - start - run.init_s
     return run
-
-
-def _readable(frames: prefetch, run: Run, bar: tqdm) -> Iterator[Frame]:
-    """The frames that can be read; a damaged one is said and skipped."""
-    while True:
-        try:
-            frame = next(frames)
-        except StopIteration:
-            return
-        except FrameError as error:
-            run.skipped[error.index] = str(error)
-            bar.write(f"frame {error.index} is skipped: {error}", file=sys.stderr)
-        else:
-            yield frame
-        bar.update()
 
 
 CONSEQUENCE = {

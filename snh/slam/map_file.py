@@ -26,7 +26,7 @@ def save_map(path: Path, slam: SLAM, config: Config) -> None:
 
 
 def load_map(path: Path) -> tuple[SceneField, Config, np.ndarray]:
-    """The field, its configuration and the keyframes' poses [M, 4, 4]. Raises DataError for anything but such a file."""
+    """The field, its configuration and the keyframes' poses [M, 4, 4]. Raises DataError for any other file."""
     if not path.is_file():
         raise DataError(f"there is no map at {path}; give the output folder of a finished 'snh-slam run'")
     try:
