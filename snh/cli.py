@@ -49,8 +49,11 @@ def _parser() -> argparse.ArgumentParser:
     mesh.set_defaults(command=_mesh)
 
     evaluate = commands.add_parser("eval", help="compare a trajectory or a mesh with a reference")
-    evaluate.add_argument("estimate", type=Path, help="output folder of a run, a TUM trajectory, or a mesh file")
-    evaluate.add_argument("reference", type=Path, help="TUM trajectory or mesh file to compare with")
+    evaluate.add_argument("estimate", type=Path, help="output folder of a run, or a TUM trajectory")
+    evaluate.add_argument("reference", type=Path, help="TUM trajectory, mesh file, or folder of the recording")
+    evaluate.add_argument("--source", help="recording whose reference poses place a run's mesh in the reference mesh")
+    evaluate.add_argument("--protocol", default="occlusion", choices=["frustum", "occlusion", "virtual"],
+                          help="how both meshes are culled (default: occlusion)")  # fmt: skip
     evaluate.add_argument("--json", type=Path, help="also write the figures to this file")
     evaluate.set_defaults(command=_eval)
 
@@ -133,13 +136,13 @@ def _mesh(a: argparse.Namespace) -> int:
 
 
 def _eval(a: argparse.Namespace) -> int:
-    from snh.run import compare
+    from snh.compare import compare
 
-    return compare(a.estimate, a.reference, a.json)
+    return compare(a.estimate, a.reference, a.source, a.protocol, a.json)
 
 
 def _doctor(a: argparse.Namespace) -> int:
-    from snh.run import doctor
+    from snh.doctor import doctor
 
     return doctor()
 

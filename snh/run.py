@@ -18,14 +18,15 @@ from tqdm import tqdm
 
 from snh import ops
 from snh.config import Config
-from snh.datasets import FrameError, Sequence, check, prefetch
-from snh.errors import DataError, OutputError
+from snh.datasets import FrameError, Sequence, View, check, open_sequence, prefetch
+from snh.errors import OutputError
+from snh.eval.reconstruction import evaluate_reconstruction
 from snh.eval.trajectory import ate, write_tum
 from snh.files import write_atomically
 from snh.mesh import Mesh, candidate_blocks, extract_mesh, save_mesh
 from snh.nn import SceneField
 from snh.slam import SLAM
-from snh.slam.map_file import save_map
+from snh.slam.map_file import load_map, save_map
 from snh.viz import dollhouse_view, draw_path, render_mesh, save_png, up_direction
 
 
@@ -46,14 +47,50 @@ def run_sequence(
     sequence: Sequence, config: Config, out: Path, seed: int, threads: int | None, with_mesh: bool, quiet: bool
 ) -> int:
     """SLAM over a sequence; results in `out`. Returns the exit code: 0, or 130 after an interrupt."""
-    if len(sequence) < 2:
-        raise DataError(f"'{sequence.name}' has a single frame; SLAM needs at least two")
     check(sequence)
     prepare_output(out)
     run = track_sequence(sequence, config, seed, threads, quiet)
     metrics, _ = save_run(run, sequence, config, out, with_mesh)
     print(summary(metrics, out))
     return 130 if run.interrupted else 0
+
+
+def run_demo(
+    config: Config, out: Path, n_frames: int, seed: int, threads: int | None, with_mesh: bool, quiet: bool
+) -> int:
+    """SLAM in the built-in room, judged by its exact poses and surface."""
+    sequence = open_sequence("builtin", frames=n_frames)
+    prepare_output(out)
+    print(f"the built-in room: {len(sequence)} frames of {sequence.camera.width} x {sequence.camera.height} pixels")
+    run = track_sequence(sequence, config, seed, threads, quiet)
+    metrics, mesh = save_run(run, sequence, config, out, with_mesh)
+    if mesh is not None and not run.interrupted:
+        print("measuring the mesh against the exact surface")
+        metrics.update(_against_truth(run, sequence, mesh))
+        write_metrics(out, metrics)
+    print(summary(metrics, out))
+    return 130 if run.interrupted else 0
+
+
+def _against_truth(run: Run, sequence: View, mesh: Mesh) -> dict:
+    """Errors of a mesh of the built-in room, moved to the room by the trajectory's alignment."""
+    vertices, faces = sequence.source.ground_truth_mesh()
+    truth = Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.zeros((len(vertices), 3), np.uint8))
+    T_ref = sequence.reference()[run.indices]
+    placed = mesh.transformed(ate(run.slam.trajectory(), T_ref).T_ref_est)
+    return evaluate_reconstruction(placed, truth, sequence.camera, T_ref[::2])
+
+
+def mesh_again(run: Path, voxel: float | None, out: Path | None) -> int:
+    """Extracts the mesh of a finished run's map once more."""
+    field, config, _ = load_map(run / "map.npz")
+    if voxel is not None:
+        config = config.updated({"mesh": {"voxel": voxel}}, "--voxel")
+    path = out or run / "mesh.ply"
+    mesh = mesh_of(field, config.mesh.voxel)
+    save_mesh(mesh, path)
+    print(f"  {len(mesh.vertices)} vertices, {len(mesh.faces)} faces in {path}")
+    return 0
 
 
 def prepare_output(out: Path) -> None:
