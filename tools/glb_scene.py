@@ -32,7 +32,8 @@ class MipTextures:
         starts = np.cumsum([0] + [level.shape[0] * level.shape[1] for chain in chains for level in chain])
         first = np.cumsum([0] + [len(chain) for chain in chains])
         self.start = np.array(
-            [[starts[first[t] + min(k, len(c) - 1)] for k in range(self.n_levels)] for t, c in enumerate(chains)], np.int64
+            [[starts[first[t] + min(k, len(c) - 1)] for k in range(self.n_levels)] for t, c in enumerate(chains)],
+            np.int64,
         )
         self.texels = np.concatenate([level.reshape(-1, 3) for chain in chains for level in chain])
 
@@ -127,7 +128,11 @@ class GlbScene:
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         ua, ub, uc = self.uv[self.faces].transpose(1, 0, 2)
         (x1, y1), (x2, y2) = (ub - ua).T, (uc - ua).T
-        texels = np.abs(x1 * y2 - x2 * y1) * self.textures.width[self.texture_of, 0] * self.textures.height[self.texture_of, 0]
+        texels = (
+            np.abs(x1 * y2 - x2 * y1)
+            * self.textures.width[self.texture_of, 0]
+            * self.textures.height[self.texture_of, 0]
+        )
         return np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)
 
     def cast(self, rays_o: np.ndarray, rays_d: np.ndarray) -> Hits:

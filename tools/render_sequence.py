@@ -1,6 +1,6 @@
 """Renders a GLB scene along a camera path into a sequence of the Replica layout with exact depth and poses.
 
-    python tools/render_sequence.py room.glb path.txt OUT [--frames 300] [--size 640x480] [--kinect] [--exposure] [--blur]
+    python tools/render_sequence.py room.glb path.txt OUT [--frames 300] [--kinect] [--exposure] [--blur]
 
 Written: results/frameNNNNNN.jpg, results/depthNNNNNN.png (uint16, 6553.5 per metre, 0 beyond 10 m),
 traj.txt (camera to world, 16 numbers a line, OpenCV axes), cam_params.json, and mesh.ply, the scene itself.
@@ -42,7 +42,9 @@ def read_path(path: Path) -> np.ndarray:
     except ValueError as error:
         raise DataError(f"the camera path {path} is not a table of numbers: {error}") from error
     if rows.shape[1] != 8 or len(rows) == 0:
-        raise DataError(f"the camera path {path} needs 8 numbers a line (index x y z qx qy qz qw), found {rows.shape[1]}")
+        raise DataError(
+            f"the camera path {path} needs 8 numbers a line (index x y z qx qy qz qw), found {rows.shape[1]}"
+        )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, 3] = rows[:, 1:4]
     poses[:, :3, :3] = [rotation_from_quaternion(q) for q in rows[:, 4:]]
@@ -136,10 +138,10 @@ def fit_path(scene: GlbScene, poses: np.ndarray, clearance: float) -> np.ndarray
             if best is None or score > best[0]:
                 best = score, placed
     if best is None:
-        extent = np.ptp(poses[:, :3, 3], axis=0)
+        size = " x ".join(f"{e:.1f}" for e in np.ptp(poses[:, :3, 3], axis=0))
         raise DataError(
-            f"the path ({' x '.join(f'{e:.1f}' for e in extent)} m) does not fit into the scene with a clearance of "
-            f"{clearance:.2f} m; about {max(0.0, reachable - GRID):.2f} m is reachable: lower --clearance or use --shrink"
+            f"the path ({size} m) does not fit into the scene with a clearance of {clearance:.2f} m; "
+            f"about {max(0.0, reachable - GRID):.2f} m is reachable: lower --clearance or use --shrink"
         )
     return best[1]
 
@@ -178,11 +180,15 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("scene", type=Path, help="GLB file in metres")
     parser.add_argument("path", type=Path, help="lines of: index x y z qx qy qz qw")
     parser.add_argument("out", type=Path, help="folder to write")
-    parser.add_argument("--size", default="640x480", help="image size (default 640x480); the focal length is 525/640 x width")
+    parser.add_argument(
+        "--size", default="640x480", help="image size (default 640x480); the focal length is 525/640 x width"
+    )
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--start", type=int, default=0, help="first line of the path to use")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th line of the path")
-    parser.add_argument("--up", choices=["auto", "y", "z"], default="auto", help="the scene's vertical (auto: its smaller extent)")
+    parser.add_argument(
+        "--up", choices=["auto", "y", "z"], default="auto", help="the scene's vertical (auto: its smaller extent)"
+    )
     parser.add_argument("--clearance", type=float, default=0.4, help="least distance of the camera to any surface, m")
     parser.add_argument("--shrink", type=float, default=1.0, help="scale of the path's positions")
     parser.add_argument("--jobs", type=int, default=2, help="frames rendered at the same time")

@@ -18,7 +18,21 @@ using Vec = Eigen::Vector3d;
 using Mat = Eigen::Matrix3d;
 
 // Colours are reflectances, 0..1, as a screen shows them (gamma 2).
-enum class Pattern { plain, plaster, wood, planks, checker, stripes, carpet, fabric, wallpaper, picture, window, book, parcel };
+enum class Pattern {
+  plain,
+  plaster,
+  wood,
+  planks,
+  checker,
+  stripes,
+  carpet,
+  fabric,
+  wallpaper,
+  picture,
+  window,
+  book,
+  parcel
+};
 
 struct Material {
   Pattern pattern = Pattern::plain;
@@ -58,7 +72,7 @@ struct Surface {
 class LightVolume {
  public:
   void build(const struct Room& room);
-  double ambient(const Vec& point, const Vec& normal) const;       // 0..1, 1 = open
+  double ambient(const Vec& point, const Vec& normal) const;      // 0..1, 1 = open
   double lamp(int k, const Vec& point, const Vec& normal) const;  // 0..1, 1 = lit
 
  private:

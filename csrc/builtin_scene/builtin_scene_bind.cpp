@@ -27,8 +27,8 @@ snh::ParallelFor threads(int count) {
   };
 }
 
-py::tuple render(const Room& room, const Doubles& T_wc, int width, int height, double fx, double fy, double cx, double cy,
-                 int n_threads) {
+py::tuple render(const Room& room, const Doubles& T_wc, int width, int height, double fx, double fy,
+                 double cx, double cy, int n_threads) {
   if (T_wc.ndim() != 2 || T_wc.shape(0) != 4 || T_wc.shape(1) != 4)
     throw std::invalid_argument("BuiltinRoom.render: T_wc must have shape [4, 4]");
   if (width < 1 || height < 1 || n_threads < 1)
@@ -40,7 +40,8 @@ py::tuple render(const Room& room, const Doubles& T_wc, int width, int height, d
   const double* pose = T_wc.data();
   {
     py::gil_scoped_release unlocked;
-    snh::builtin::render(room, {width, height, fx, fy, cx, cy}, pose, rgb_data, depth_data, threads(n_threads));
+    snh::builtin::render(room, {width, height, fx, fy, cx, cy}, pose, rgb_data, depth_data,
+                         threads(n_threads));
   }
   return py::make_tuple(rgb, depth);
 }
@@ -67,17 +68,19 @@ py::array_t<double> signed_distance(const Room& room, const Doubles& points) {
 }
 
 const snh::Part part([](py::module_& m) {
-  py::class_<Room>(m, "BuiltinRoom", "A furnished room defined in code; see csrc/builtin_scene/builtin_scene.h.")
+  py::class_<Room>(m, "BuiltinRoom",
+                   "A furnished room defined in code; see csrc/builtin_scene/builtin_scene.h.")
       .def(py::init(&snh::builtin::make_room), py::arg("number"))
       .def_property_readonly("bounds",
                              [](const Room& room) {
                                py::array_t<double> bounds({2, 3});
                                for (int k = 0; k < 3; ++k)
-                                 bounds.mutable_at(0, k) = room.low[k], bounds.mutable_at(1, k) = room.high[k];
+                                 bounds.mutable_at(0, k) = room.low[k],
+                                                      bounds.mutable_at(1, k) = room.high[k];
                                return bounds;
                              })
-      .def("render", &render, py::arg("T_wc"), py::arg("width"), py::arg("height"), py::arg("fx"), py::arg("fy"),
-           py::arg("cx"), py::arg("cy"), py::arg("n_threads") = 1)
+      .def("render", &render, py::arg("T_wc"), py::arg("width"), py::arg("height"), py::arg("fx"),
+           py::arg("fy"), py::arg("cx"), py::arg("cy"), py::arg("n_threads") = 1)
       .def("mesh", &mesh, py::arg("edge") = 0.05)
       .def("signed_distance", &signed_distance, py::arg("points"));
 });

@@ -83,13 +83,16 @@ struct View {
 std::array<int, 4> screen_bounds(const Pinhole& camera, const LocalView& view, const Vec& half) {
   double u0 = kInfinity, u1 = -kInfinity, v0 = kInfinity, v1 = -kInfinity;
   for (int corner = 0; corner < 8; ++corner) {
-    const Vec p(corner & 1 ? half[0] : -half[0], corner & 2 ? half[1] : -half[1], corner & 4 ? half[2] : -half[2]);
+    const Vec p(corner & 1 ? half[0] : -half[0], corner & 2 ? half[1] : -half[1],
+                corner & 4 ? half[2] : -half[2]);
     const Vec q = view.R_sc.transpose() * (p - view.origin);
     if (q[2] < 0.01) return {0, camera.width - 1, 0, camera.height - 1};
     const double u = q[0] / q[2] * camera.fx + camera.cx, v = q[1] / q[2] * camera.fy + camera.cy;
     u0 = std::min(u0, u), u1 = std::max(u1, u), v0 = std::min(v0, v), v1 = std::max(v1, v);
   }
-  const auto first = [](double x, int n) { return static_cast<int>(std::clamp(std::floor(x), 0.0, n + 0.0)); };
+  const auto first = [](double x, int n) {
+    return static_cast<int>(std::clamp(std::floor(x), 0.0, n + 0.0));
+  };
   const auto last = [](double x, int n) { return static_cast<int>(std::clamp(std::ceil(x), -1.0, n - 1.0)); };
   return {first(u0, camera.width), last(u1, camera.width), first(v0, camera.height), last(v1, camera.height)};
 }
@@ -103,7 +106,8 @@ View make_view(const Room& room, const Pinhole& camera, const double* T_wc) {
   const auto T = Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(T_wc);
   View view{room, camera, T.topLeftCorner<3, 3>(), T.topRightCorner<3, 1>(), {}, {}};
   for (const Solid& solid : room.solids) {
-    const LocalView local{solid.R_ws.transpose() * (view.origin - solid.center), solid.R_ws.transpose() * view.R_wc};
+    const LocalView local{solid.R_ws.transpose() * (view.origin - solid.center),
+                          solid.R_ws.transpose() * view.R_wc};
     view.local.push_back(local);
     view.bounds.push_back(behind(local, solid.half) ? std::array<int, 4>{0, -1, 0, -1}
                                                     : screen_bounds(camera, local, solid.half));
@@ -135,9 +139,15 @@ void cast_rows(const View& view, int begin, int end, float* depth, int* seen) {
   std::fill(seen + begin * width, seen + end * width, -1);
   for (int k = 0; k < static_cast<int>(view.room.solids.size()); ++k) {
     switch (view.room.solids[k].shape) {
-      case Shape::box: cast_solid<enter_box>(view, k, begin, end, depth, seen); break;
-      case Shape::cylinder: cast_solid<enter_cylinder>(view, k, begin, end, depth, seen); break;
-      case Shape::sphere: cast_solid<enter_sphere>(view, k, begin, end, depth, seen); break;
+      case Shape::box:
+        cast_solid<enter_box>(view, k, begin, end, depth, seen);
+        break;
+      case Shape::cylinder:
+        cast_solid<enter_cylinder>(view, k, begin, end, depth, seen);
+        break;
+      case Shape::sphere:
+        cast_solid<enter_sphere>(view, k, begin, end, depth, seen);
+        break;
     }
   }
 }
@@ -192,7 +202,8 @@ int seen_around(const View& view, const int* seen, int u, int v, std::array<int,
   for (int y = std::max(v - 1, 0); y <= std::min(v + 1, view.camera.height - 1); ++y)
     for (int x = std::max(u - 1, 0); x <= std::min(u + 1, view.camera.width - 1); ++x) {
       const int number = seen[static_cast<int64_t>(y) * view.camera.width + x];
-      if (number >= 0 && std::find(found.begin(), found.begin() + n, number) == found.begin() + n) found[n++] = number;
+      if (number >= 0 && std::find(found.begin(), found.begin() + n, number) == found.begin() + n)
+        found[n++] = number;
     }
   return n;
 }
@@ -228,16 +239,20 @@ void smooth_rows(const View& view, int begin, int end, const int* seen, uint8_t*
 
 double intersect(Shape shape, const Vec& half, const Vec& origin_s, const Vec& direction_s) {
   switch (shape) {
-    case Shape::box: return enter_box(half, origin_s, direction_s);
-    case Shape::cylinder: return enter_cylinder(half, origin_s, direction_s);
-    default: return enter_sphere(half, origin_s, direction_s);
+    case Shape::box:
+      return enter_box(half, origin_s, direction_s);
+    case Shape::cylinder:
+      return enter_cylinder(half, origin_s, direction_s);
+    default:
+      return enter_sphere(half, origin_s, direction_s);
   }
 }
 
 double Room::distance(const Vec& point) const {
   double nearest = kInfinity;
   for (const Solid& solid : solids) {
-    if ((point - solid.center).norm() - solid.half.norm() > nearest) continue;  // its bounding sphere is farther
+    if ((point - solid.center).norm() - solid.half.norm() > nearest)
+      continue;  // its bounding sphere is farther
     nearest = std::min(nearest, solid_distance(solid, point));
   }
   return nearest;

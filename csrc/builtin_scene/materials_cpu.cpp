@@ -16,7 +16,8 @@ uint32_t mix_bits(uint32_t x) {
 
 // Uniform in [0, 1) for a lattice point.
 double random_at(int i, int j, uint32_t seed) {
-  const uint32_t hash = static_cast<uint32_t>(i) * 0x9e3779b1u ^ static_cast<uint32_t>(j) * 0x85ebca77u ^ seed * 0xc2b2ae3du;
+  const uint32_t hash =
+      static_cast<uint32_t>(i) * 0x9e3779b1u ^ static_cast<uint32_t>(j) * 0x85ebca77u ^ seed * 0xc2b2ae3du;
   return mix_bits(hash) * (1.0 / 4294967296.0);
 }
 
@@ -77,7 +78,8 @@ Vec planks(const Material& m, double u, double v, double width) {
   const int i = static_cast<int>(std::floor(along));
   const double tone = 0.86 + 0.28 * random_at(i, j, m.seed + 1);
   const Vec board = wood(m, u, v, width, m.seed + static_cast<uint32_t>(i * 31 + j)) * tone;
-  const double joint = std::max(wave(row + 0.015, 0.03, width / m.scale), wave(along + 0.002, 0.004, width / length));
+  const double joint =
+      std::max(wave(row + 0.015, 0.03, width / m.scale), wave(along + 0.002, 0.004, width / length));
   return board * (1 - 0.6 * joint);
 }
 
@@ -100,7 +102,8 @@ Vec fabric(const Material& m, double u, double v, double width) {
 Vec carpet(const Material& m, const Surface& s, double width) {
   const double margin = std::min(s.half_u - std::abs(s.u), s.half_v - std::abs(s.v));
   const double cell = m.scale;
-  const double du = std::abs(s.u / cell - std::round(s.u / cell)), dv = std::abs(s.v / cell - std::round(s.v / cell));
+  const double du = std::abs(s.u / cell - std::round(s.u / cell)),
+               dv = std::abs(s.v / cell - std::round(s.v / cell));
   const Vec accent(0.85, 0.66, 0.38);
   Vec color = blend(m.a, m.b, inside((du + dv - 0.34) * cell, width));
   color = blend(color, accent, inside((du + dv - 0.14) * cell, width));
@@ -164,8 +167,10 @@ Vec window(const Material& m, const Surface& s, double width) {
   const double y = s.v / s.half_v;
   const double clouds = ramp(1.7 * cloud(s.u / 0.5, s.v / 0.25, width / 0.25, m.seed) - 0.5);
   Vec color = blend(blend(m.a, m.b, ramp(0.6 - 0.6 * y)), Vec(1, 1, 1), 0.6 * clouds);
-  const double trees = -0.45 + 0.5 * (noise(s.u / 0.22, 0.3, m.seed) - 0.5) + 0.2 * (noise(s.u / 0.07, 0.7, m.seed) - 0.5);
-  const Vec leaves = blend(Vec(0.42, 0.55, 0.34), Vec(0.60, 0.70, 0.45), cloud(s.u / 0.09, s.v / 0.09, width / 0.09, m.seed));
+  const double trees =
+      -0.45 + 0.5 * (noise(s.u / 0.22, 0.3, m.seed) - 0.5) + 0.2 * (noise(s.u / 0.07, 0.7, m.seed) - 0.5);
+  const Vec leaves = blend(Vec(0.42, 0.55, 0.34), Vec(0.60, 0.70, 0.45),
+                           cloud(s.u / 0.09, s.v / 0.09, width / 0.09, m.seed));
   return blend(color, leaves, inside((y - trees) * s.half_v, width));
 }
 
@@ -182,7 +187,8 @@ Vec book(const Material& m, const Surface& s, double width) {
 Vec parcel(const Material& m, const Surface& s, double width) {
   Vec color = plaster(m, s.u, s.v, width) * (0.96 + 0.08 * wave(s.u / 0.012, 0.5, width / 0.012));
   color = blend(color, Vec(0.80, 0.70, 0.50), inside(std::abs(s.v) - 0.025, width));
-  const double mark = std::max(std::abs(s.u - 0.55 * s.half_u) - 0.05, std::abs(s.v + 0.55 * s.half_v) - 0.035);
+  const double mark =
+      std::max(std::abs(s.u - 0.55 * s.half_u) - 0.05, std::abs(s.v + 0.55 * s.half_v) - 0.035);
   color = blend(color, Vec(0.93, 0.92, 0.88), inside(mark, width));
   const double print = wave(s.u / 0.016 + m.seed * 0.3, 0.45, width / 0.016) * inside(mark + 0.012, width);
   return blend(color, Vec(0.15, 0.15, 0.17), print);
@@ -192,22 +198,34 @@ Vec parcel(const Material& m, const Surface& s, double width) {
 
 Vec reflectance(const Material& m, const Surface& s, double width) {
   switch (m.pattern) {
-    case Pattern::plain: return m.a;
-    case Pattern::plaster: return plaster(m, s.u, s.v, width);
+    case Pattern::plain:
+      return m.a;
+    case Pattern::plaster:
+      return plaster(m, s.u, s.v, width);
     case Pattern::wood: {
       const bool upright = s.half_v > s.half_u;
       return upright ? wood(m, s.v, s.u, width, m.seed) : wood(m, s.u, s.v, width, m.seed);
     }
-    case Pattern::planks: return planks(m, s.u, s.v, width);
-    case Pattern::checker: return checker(m, s.u, s.v, width);
-    case Pattern::stripes: return blend(m.a, m.b, wave(s.u / m.scale, 0.5, width / m.scale));
-    case Pattern::carpet: return carpet(m, s, width);
-    case Pattern::fabric: return fabric(m, s.u, s.v, width);
-    case Pattern::wallpaper: return wallpaper(m, s.u, s.v, width);
-    case Pattern::picture: return picture(m, s, width);
-    case Pattern::window: return window(m, s, width);
-    case Pattern::book: return book(m, s, width);
-    case Pattern::parcel: return parcel(m, s, width);
+    case Pattern::planks:
+      return planks(m, s.u, s.v, width);
+    case Pattern::checker:
+      return checker(m, s.u, s.v, width);
+    case Pattern::stripes:
+      return blend(m.a, m.b, wave(s.u / m.scale, 0.5, width / m.scale));
+    case Pattern::carpet:
+      return carpet(m, s, width);
+    case Pattern::fabric:
+      return fabric(m, s.u, s.v, width);
+    case Pattern::wallpaper:
+      return wallpaper(m, s.u, s.v, width);
+    case Pattern::picture:
+      return picture(m, s, width);
+    case Pattern::window:
+      return window(m, s, width);
+    case Pattern::book:
+      return book(m, s, width);
+    case Pattern::parcel:
+      return parcel(m, s, width);
   }
   return m.a;
 }

@@ -27,7 +27,8 @@ class Tessellator {
   void patch(const Solid& solid, int n, int m, const std::function<Vec(double, double)>& position) {
     std::vector<int> index(static_cast<size_t>(n + 1) * (m + 1), -1);
     const auto world = [&](int i, int j) {
-      return Vec(solid.center + solid.R_ws * position(static_cast<double>(i) / n, static_cast<double>(j) / m));
+      return Vec(solid.center +
+                 solid.R_ws * position(static_cast<double>(i) / n, static_cast<double>(j) / m));
     };
     const auto triangle = [&](const std::array<std::array<int, 2>, 3>& corner) {
       std::array<Vec, 3> p;
@@ -36,7 +37,8 @@ class Tessellator {
       Eigen::Vector3i face;
       for (int k = 0; k < 3; ++k) {
         int& vertex = index[static_cast<size_t>(corner[k][0]) * (m + 1) + corner[k][1]];
-        if (vertex < 0) vertex = static_cast<int>(mesh_.vertices.size()), mesh_.vertices.push_back(p[k].cast<float>());
+        if (vertex < 0)
+          vertex = static_cast<int>(mesh_.vertices.size()), mesh_.vertices.push_back(p[k].cast<float>());
         face[k] = vertex;
       }
       mesh_.faces.push_back(face);
@@ -55,11 +57,13 @@ class Tessellator {
     if (normal.norm() < 1e-12) return false;  // at the poles of spheres and the centres of caps
     const Vec middle = (p[0] + p[1] + p[2]) / 3, ahead = normal.normalized() * kNudge;
     if (free(middle + ahead)) return true;
-    return std::any_of(p.begin(), p.end(), [&](const Vec& q) { return free(q + (middle - q) * 0.02 + ahead); });
+    return std::any_of(p.begin(), p.end(),
+                       [&](const Vec& q) { return free(q + (middle - q) * 0.02 + ahead); });
   }
 
   bool free(const Vec& q) const {
-    return (q.array() > room_.low.array()).all() && (q.array() < room_.high.array()).all() && room_.distance(q) > 0;
+    return (q.array() > room_.low.array()).all() && (q.array() < room_.high.array()).all() &&
+           room_.distance(q) > 0;
   }
 
   const Room& room_;
@@ -111,9 +115,15 @@ Mesh make_mesh(const Room& room, double edge) {
   Tessellator out(room, mesh);
   for (const Solid& solid : room.solids) {
     switch (solid.shape) {
-      case Shape::box: add_box(out, solid, edge); break;
-      case Shape::cylinder: add_cylinder(out, solid, edge); break;
-      case Shape::sphere: add_sphere(out, solid); break;
+      case Shape::box:
+        add_box(out, solid, edge);
+        break;
+      case Shape::cylinder:
+        add_cylinder(out, solid, edge);
+        break;
+      case Shape::sphere:
+        add_sphere(out, solid);
+        break;
     }
   }
   return mesh;

@@ -1,4 +1,4 @@
-"""What a Kinect-like sensor makes of exact depth and colour. Repeatable: everything follows from seed and frame index."""
+"""What a Kinect-like sensor makes of exact depth and colour. Seed and frame index determine every pixel."""
 
 from __future__ import annotations
 
@@ -58,7 +58,9 @@ class DepthSensor:
 
     def _quantised(self, z: np.ndarray, camera: Camera) -> np.ndarray:
         steps = self._disparity_scale(camera) / (np.maximum(z, 0.05) * self.disparity_step)
-        return (self._disparity_scale(camera) / (np.maximum(np.rint(steps), 1) * self.disparity_step)).astype(np.float32)
+        return (self._disparity_scale(camera) / (np.maximum(np.rint(steps), 1) * self.disparity_step)).astype(
+            np.float32
+        )
 
     def _shadow(self, z: np.ndarray, camera: Camera) -> np.ndarray:
         """Pixels the projector does not light: its column for them is right of that of a pixel farther right."""
@@ -112,7 +114,7 @@ class ColorSensor:
     def gain(self, index: int) -> np.ndarray:
         """Gain of red, green and blue, [3]: three slow waves with phases from the seed."""
         phase = np.random.default_rng([self.seed, 2]).uniform(0, 2 * np.pi, (3, 3))
-        wave = np.sin(index * np.float64([0.021, 0.047, 0.083])[:, None] + phase) / 3
+        wave = np.sin(index * np.array([0.021, 0.047, 0.083])[:, None] + phase) / 3
         common = wave[:, 0].sum()
         balance = wave.sum(0) - wave.sum(0).mean()
         return (1 + self.exposure * (0.8 * common + 0.1 * balance)).astype(np.float32)
@@ -123,7 +125,9 @@ class ColorSensor:
         total = np.zeros(rgb.shape, np.float32)
         for share in np.linspace(-0.5, 0.5, taps) * self.shutter:
             moved = (flow * np.float32(share)).astype(np.float32)
-            total += cv2.remap(rgb, u + moved[..., 0], v + moved[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            total += cv2.remap(
+                rgb, u + moved[..., 0], v + moved[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
         return total / taps
 
 
