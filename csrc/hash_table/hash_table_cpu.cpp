@@ -1,9 +1,8 @@
-#include "hash_table/hash_table.h"
-
 #include <algorithm>
 
 #include "common/key.h"
 #include "common/lattice.h"
+#include "hash_table/hash_table.h"
 
 namespace snh::cpu {
 
@@ -26,8 +25,8 @@ void place_brick(int64_t key, int32_t number, int32_t* probe, int64_t capacity) 
 bool in_key_range(const int64_t* vertex) {
   constexpr int64_t kLimit = static_cast<int64_t>(kBrickOffset) * kBrickSide;
   const auto inside = [](int64_t x) { return -kLimit <= x && x < kLimit; };
-  return 0 <= vertex[0] && vertex[0] < kMaxLevels && 0 <= vertex[1] && vertex[1] < kPlanes && inside(vertex[2]) &&
-         inside(vertex[3]);
+  return 0 <= vertex[0] && vertex[0] < kMaxLevels && 0 <= vertex[1] && vertex[1] < kPlanes &&
+         inside(vertex[2]) && inside(vertex[3]);
 }
 
 }  // namespace
@@ -66,9 +65,10 @@ void hash_table_find(const int64_t* vertices, int64_t n_vertices, const int32_t*
                      const int64_t* brick_keys, const int64_t* masks, int64_t* slots) {
   for (int64_t n = 0; n < n_vertices; ++n) {
     const int64_t* v = vertices + 4 * n;  // level, plane, i, j
-    slots[n] = in_key_range(v) ? find_slot(static_cast<int>(v[0]), static_cast<int>(v[1]), static_cast<int32_t>(v[2]),
-                                           static_cast<int32_t>(v[3]), probe, capacity, brick_keys, masks)
-                               : -1;
+    slots[n] = in_key_range(v)
+                   ? find_slot(static_cast<int>(v[0]), static_cast<int>(v[1]), static_cast<int32_t>(v[2]),
+                               static_cast<int32_t>(v[3]), probe, capacity, brick_keys, masks)
+                   : -1;
   }
 }
 

@@ -12,9 +12,9 @@ void check_keys(const char* op, const char* arg, const Tensor& keys) {
 }
 
 void check_capacity(const char* op, int64_t capacity, int64_t n_bricks) {
-  STD_TORCH_CHECK(capacity > n_bricks && (capacity & (capacity - 1)) == 0 && capacity <= (int64_t(1) << 31), "snh::", op,
-                  ": the probe array must have a power of two places, more than the ", n_bricks, " bricks, got ",
-                  capacity);
+  STD_TORCH_CHECK(capacity > n_bricks && (capacity & (capacity - 1)) == 0 && capacity <= (int64_t(1) << 31),
+                  "snh::", op, ": the probe array must have a power of two places, more than the ", n_bricks,
+                  " bricks, got ", capacity);
 }
 
 void check_probe(const char* op, const Tensor& probe, int64_t n_bricks) {
@@ -31,7 +31,8 @@ void check_ascending(const char* op, const int64_t* keys, int64_t n_keys) {
 }
 
 void check_in_place(const char* op, const char* arg, const Tensor& t) {
-  STD_TORCH_CHECK(t.is_contiguous(), "snh::", op, ": argument '", arg, "' is written in place and must be contiguous");
+  STD_TORCH_CHECK(t.is_contiguous(), "snh::", op, ": argument '", arg,
+                  "' is written in place and must be contiguous");
 }
 
 Tensor hash_table_build(const Tensor& brick_keys, int64_t capacity) {
@@ -40,9 +41,10 @@ Tensor hash_table_build(const Tensor& brick_keys, int64_t capacity) {
   check_capacity(kOp, capacity, brick_keys.size(0));
   const Tensor keys = torch::stable::contiguous(brick_keys);
   Tensor probe = torch::stable::new_empty(keys, {capacity}, ScalarType::Int);
-  const int64_t placed = cpu::hash_table_build(in<int64_t>(keys), keys.size(0), out<int32_t>(probe), capacity);
-  STD_TORCH_CHECK(placed == keys.size(0), "snh::", kOp, ": argument 'brick_keys' must not repeat a key, entry ", placed,
-                  " does");
+  const int64_t placed =
+      cpu::hash_table_build(in<int64_t>(keys), keys.size(0), out<int32_t>(probe), capacity);
+  STD_TORCH_CHECK(placed == keys.size(0), "snh::", kOp,
+                  ": argument 'brick_keys' must not repeat a key, entry ", placed, " does");
   return probe;
 }
 
@@ -54,7 +56,8 @@ Tensor hash_table_numbers(const Tensor& probe, const Tensor& brick_keys, const T
   const Tensor p = torch::stable::contiguous(probe), b = torch::stable::contiguous(brick_keys);
   const Tensor k = torch::stable::contiguous(keys);
   Tensor numbers = torch::stable::new_empty(k, {k.size(0)}, ScalarType::Int);
-  cpu::hash_table_numbers(in<int64_t>(k), k.size(0), in<int32_t>(p), p.size(0), in<int64_t>(b), out<int32_t>(numbers));
+  cpu::hash_table_numbers(in<int64_t>(k), k.size(0), in<int32_t>(p), p.size(0), in<int64_t>(b),
+                          out<int32_t>(numbers));
   return numbers;
 }
 
@@ -78,13 +81,14 @@ void hash_table_insert_(Tensor probe, Tensor brick_keys, Tensor masks, int64_t n
   int64_t n_after = n_bricks;
   for (int64_t i = 0; i < k.size(0); ++i) n_after += in<int32_t>(numbers)[i] < 0;
   check_probe(kOp, probe, n_after);
-  STD_TORCH_CHECK(n_bricks >= 0 && n_after <= brick_keys.size(0), "snh::", kOp, ": the storage holds ", brick_keys.size(0),
-                  " bricks, but ", n_after, " are needed");
-  cpu::hash_table_insert(in<int64_t>(k), in<int64_t>(m), k.size(0), n_bricks, out<int32_t>(probe), probe.size(0),
-                         out<int64_t>(brick_keys), out<int64_t>(masks));
+  STD_TORCH_CHECK(n_bricks >= 0 && n_after <= brick_keys.size(0), "snh::", kOp, ": the storage holds ",
+                  brick_keys.size(0), " bricks, but ", n_after, " are needed");
+  cpu::hash_table_insert(in<int64_t>(k), in<int64_t>(m), k.size(0), n_bricks, out<int32_t>(probe),
+                         probe.size(0), out<int64_t>(brick_keys), out<int64_t>(masks));
 }
 
-Tensor hash_table_find(const Tensor& probe, const Tensor& brick_keys, const Tensor& masks, const Tensor& vertices) {
+Tensor hash_table_find(const Tensor& probe, const Tensor& brick_keys, const Tensor& masks,
+                       const Tensor& vertices) {
   constexpr const char* kOp = "hash_table_find";
   check_keys(kOp, "brick_keys", brick_keys);
   check_probe(kOp, probe, 0);
@@ -110,7 +114,8 @@ STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
   m.def("hash_table_build(Tensor brick_keys, int capacity) -> Tensor");
   m.def("hash_table_numbers(Tensor probe, Tensor brick_keys, Tensor keys) -> Tensor");
   m.def(
-      "hash_table_insert_(Tensor(a!) probe, Tensor(b!) brick_keys, Tensor(c!) masks, int n_bricks, Tensor keys, "
+      "hash_table_insert_(Tensor(a!) probe, Tensor(b!) brick_keys, Tensor(c!) masks, int n_bricks, Tensor "
+      "keys, "
       "Tensor new_masks) -> ()");
   m.def("hash_table_find(Tensor probe, Tensor brick_keys, Tensor masks, Tensor vertices) -> Tensor");
 }

@@ -145,7 +145,7 @@ def write_tum(path: str | Path, timestamps: np.ndarray, T_wc: np.ndarray) -> Non
 
 
 def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """(timestamps [N] s, T_wc [N, 4, 4] float64) of a TUM file; NaN numbers are kept as NaN poses.
+    """(timestamps [N] s, T_wc [N, 4, 4] float64) of a TUM file; a line without a valid quaternion gives a NaN pose.
 
     Raises DataError, with the line, when the file is missing or a line is not eight numbers.
     """
@@ -170,5 +170,7 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     T_wc = np.tile(np.eye(4), (len(table), 1, 1))
     T_wc[:, :3, 3] = table[:, 1:4]
-    T_wc[:, :3, :3] = [rotation_from_quaternion(q) for q in table[:, 4:]] if len(table) else T_wc[:, :3, :3]
+    for T, q in zip(T_wc, table[:, 4:], strict=True):
+        norm = np.linalg.norm(q)
+        T[:3, :3] = rotation_from_quaternion(q) if 0 < norm < np.inf else np.nan
     return table[:, 0], T_wc

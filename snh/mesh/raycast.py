@@ -6,20 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snh.frame import Camera
 from snh.mesh.mesh import Mesh
-
-
-def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Pose [4, 4], camera to world, of a camera at `center` that looks at `target` with `up` ([3]) upwards."""
-    forward = np.asarray(target, dtype=np.float64) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
-    T[:3, 3] = center
-    return T
 
 
 @dataclass(frozen=True)
@@ -54,12 +41,6 @@ class RayScene:
         t = answer["t_hit"].numpy()
         face = np.where(np.isfinite(t), answer["primitive_ids"].numpy().astype(np.int64), -1)
         return Hits(t, face, np.concatenate([1 - uv.sum(axis=-1, keepdims=True), uv], axis=-1))
-
-    def depth(self, camera: Camera, T_wc: np.ndarray) -> np.ndarray:
-        """z-depth [H, W] float32 m that the camera at T_wc [4, 4] sees; 0 where it sees nothing."""
-        directions = camera.rays() @ T_wc[:3, :3].T
-        t = self.cast(T_wc[:3, 3], directions).t  # z = 1 in the camera frame, so t is the depth
-        return np.where(np.isfinite(t), t, 0).astype(np.float32)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Exact distance of points [N, 3] to the nearest point of the surface, [N] float32 m."""
