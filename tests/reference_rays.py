@@ -96,16 +96,15 @@ def ray_sample(depth, uniforms, n_base, n_surface, truncation, near, far):
 
 
 def ray_render(tsdf, color, z, sharpness, cut_behind):
-    """Eq. 6-7 in torch scalars."""
+    """Eq. 6-7 in torch scalars. The depth of the cut is one sum in the type of z, as the contract says."""
     colors, depths, weights = [], [], []
-    for s, c, d in zip(tsdf.double(), color.double(), z.double(), strict=True):
-        limit = math.inf
-        for k in range(len(s) - 1):
-            if s[k] > 0 and s[k + 1] <= 0:
-                limit = d[k].item() + math.inf if cut_behind is None else d[k].item() + cut_behind
-                break
+    for s, c, d in zip(tsdf.double(), color.double(), z, strict=True):
+        crossings = [k for k in range(len(s) - 1) if s[k] > 0 >= s[k + 1]]
+        cut = cut_behind is not None and bool(crossings)
+        kept = [not cut or (d_i <= d[crossings[0]] + cut_behind).item() for d_i in d]
+        d = d.double()
         w = [torch.sigmoid(s_i * sharpness) * torch.sigmoid(-s_i * sharpness) for s_i in s]
-        w = [w_i * (d_i.item() <= limit) for w_i, d_i in zip(w, d, strict=True)]
+        w = [w_i * keep for w_i, keep in zip(w, kept, strict=True)]
         total = sum(w) + 1e-8
         colors.append(sum((w_i * c_i for w_i, c_i in zip(w, c, strict=True)), torch.zeros(3).double()) / total)
         depths.append(sum((w_i * d_i for w_i, d_i in zip(w, d, strict=True)), torch.zeros(()).double()) / total)

@@ -38,13 +38,10 @@ Cell<T> locate(const T* point, int level, int plane, T inv_cell, const TableView
   const T p = u - T(i), q = v - T(j);
   Cell<T> cell;
   corner_slots(level, plane, i, j, table, cell.slot);
-  cell.b << (1 - p) * (1 - q), p * (1 - q), (1 - p) * q, p * q;
-  cell.b_u << q - 1, 1 - q, -q, q;
-  cell.b_v << p - 1, -p, 1 - p, p;
-  cell.b_uv << 1, -1, -1, 1;
-  cell.b_u *= inv_cell;
-  cell.b_v *= inv_cell;
-  cell.b_uv *= inv_cell * inv_cell;
+  cell.b = Corners<T>((1 - p) * (1 - q), p * (1 - q), (1 - p) * q, p * q);
+  cell.b_u = Corners<T>(q - 1, 1 - q, -q, q) * inv_cell;
+  cell.b_v = Corners<T>(p - 1, -p, 1 - p, p) * inv_cell;
+  cell.b_uv = Corners<T>(1, -1, -1, 1) * (inv_cell * inv_cell);
   for (int c = 0; c < kCorners; ++c)
     if (cell.slot[c] < 0) cell.b[c] = cell.b_u[c] = cell.b_v[c] = cell.b_uv[c] = 0;
   return cell;
@@ -239,7 +236,7 @@ struct SecondOrder : FirstOrder<T, F> {
   Planes<T, F> phi_dot, beta;
 };
 
-// Calls body(F) with F = 3, the paper's and the default, known to the compiler: 3 times as fast as Dynamic.
+// Calls body(F) with F = 3, the paper's and the default, known to the compiler: twice as fast as Dynamic.
 template <typename T, typename Body>
 void with_features(const PlaneLookup<T>& in, const Body& body) {
   in.n_features == 3 ? body(std::integral_constant<int, 3>()) : body(std::integral_constant<int, Dynamic>());
