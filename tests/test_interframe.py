@@ -68,7 +68,9 @@ def test_hand_worked():
 def test_margin(u, v, z, inside):
     point = torch.tensor([[u * z, v * z, z]], dtype=torch.float64)
     image = torch.full((HEIGHT, WIDTH, 3), 51, dtype=torch.uint8)
-    residuals, jacobian, valid = interframe(point, torch.zeros(1, 3).double(), torch.eye(4).double(), image, (1, 1, 0, 0))
+    residuals, jacobian, valid = interframe(
+        point, torch.zeros(1, 3).double(), torch.eye(4).double(), image, (1, 1, 0, 0)
+    )
     assert valid.item() == inside
     assert residuals.flatten().tolist() == pytest.approx([0.2 * inside] * 3) and (jacobian == 0).all()
 
@@ -107,7 +109,7 @@ def test_jacobian_is_the_derivative_to_the_right_twist(dtype):
             T = T_kc @ torch.from_numpy(geometry.se3_exp(twist))
             moved.append(reference.interframe(points, color, T, image, CAMERA)[0])
         numeric = (moved[0] - moved[1]) / (2 * step)
-        # float64: 1e-15 of rounding, over the step, times 100 px/m. float32: a pixel coordinate up to 64 has 8 roundings;
+        # float64: 1e-15 of rounding, over the step, times 100 px/m. float32: 8 roundings of a coordinate up to 64 px,
         # times the image's mixed derivative, up to 4 per px^2, and up to 400 px per unit of twist
         tolerance = 1e-5 if dtype == torch.float64 else 8 * UNIT * 64 * 4 * 400
         torch.testing.assert_close(jacobian[..., k].double(), numeric, rtol=0, atol=tolerance)

@@ -86,7 +86,7 @@ def test_oracle(n_points, reduce, dtype):
         points, features, table, rows = scene(n_points, dtype, centre)
         encoded, valid = plane_lookup(points, features, table, CELL_SIZES, n_features, reduce)
         want, want_valid = reference.plane_lookup(points, features, rows, CELL_SIZES, n_features, reduce)
-        # |features| <= 1. float32: 3 roundings in a weight, 4 in the sum over corners, 2 in the sum or product of planes
+        # |features| <= 1. float32: 3 roundings in a weight, 4 in the sum over corners, 2 in that over planes; 3 planes
         tolerance = 1e-10 if dtype == torch.float64 else 3 * 9 * UNIT
         assert encoded.dtype == dtype
         torch.testing.assert_close(encoded.double(), want, rtol=0, atol=tolerance)
@@ -103,7 +103,8 @@ def test_oracle_gradients(n_points, reduce, dtype):
     g = torch.Generator().manual_seed(1)
     width = len(CELL_SIZES) * 3 * (3 if reduce == "cat" else 1)
     upstream, v_points, v_features = (
-        torch.rand(shape, generator=g, dtype=torch.float64) * 2 - 1 for shape in [(n_points, width), points.shape, features.shape]
+        torch.rand(shape, generator=g, dtype=torch.float64) * 2 - 1
+        for shape in [(n_points, width), points.shape, features.shape]
     )
     for lookup in [
         lambda p, f: plane_lookup(p, f, table, CELL_SIZES, 3, reduce)[0],

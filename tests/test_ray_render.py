@@ -55,7 +55,9 @@ def test_hand_worked(tsdf, z, cut_behind, weight):
 def test_epsilon_is_in_the_sum():
     """Far from every surface, w = exp(-|x|) is as small as the epsilon 1e-8."""
     x = -math.log(1e-8)
-    _, depth, weight = ray_render(torch.tensor([[x]]).double(), torch.ones(1, 1, 3).double(), torch.ones(1, 1).double(), 1.0)
+    _, depth, weight = ray_render(
+        torch.tensor([[x]]).double(), torch.ones(1, 1, 3).double(), torch.ones(1, 1).double(), 1.0
+    )
     assert abs(weight.item() - 0.5) < 1e-7 and abs(depth.item() - 0.5) < 1e-7
 
 
@@ -111,7 +113,9 @@ def test_oracle_gradients(n_rays, cut_behind, dtype):
 def test_not_contiguous():
     tsdf, color, z = samples(33, 12)
     want = ray_render(tsdf, color, z, 4.0, 0.3)
-    got = ray_render(tsdf.T.contiguous().T, color.permute(2, 0, 1).contiguous().permute(1, 2, 0), z.T.contiguous().T, 4.0, 0.3)
+    got = ray_render(
+        tsdf.T.contiguous().T, color.permute(2, 0, 1).contiguous().permute(1, 2, 0), z.T.contiguous().T, 4.0, 0.3
+    )
     assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
 
 
@@ -159,7 +163,12 @@ def test_opcheck():
         (torch.zeros(2, 4), torch.zeros(2, 4), torch.zeros(2, 4), r"'color' must have shape \[2, 4, 3\], got \[2, 4\]"),
         (torch.zeros(2, 4), torch.zeros(2, 4, 3), torch.zeros(2, 5), r"'z' must have shape \[2, 4\], got \[2, 5\]"),
         (torch.zeros(2, 4), torch.zeros(2, 4, 3).double(), torch.zeros(2, 4), "'color' must be Float, got Double"),
-        (torch.zeros(2, 4).half(), torch.zeros(2, 4, 3), torch.zeros(2, 4), "'tsdf' must be float32 or float64, got Half"),
+        (
+            torch.zeros(2, 4).half(),
+            torch.zeros(2, 4, 3),
+            torch.zeros(2, 4),
+            "'tsdf' must be float32 or float64, got Half",
+        ),
     ],
 )
 def test_refused(tsdf, color, z, message):

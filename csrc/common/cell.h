@@ -25,12 +25,12 @@ SNH_HD inline void corner_slots(int level, int plane, int32_t i, int32_t j, cons
   constexpr int kLast = kBrickSide - 1;
   if ((i & kLast) == kLast || (j & kLast) == kLast) {
     for (int c = 0; c < kCorners; ++c)
-      slots[c] = find_slot(level, plane, i + (c & 1), j + (c >> 1), table.probe, table.capacity, table.brick_keys,
-                           table.masks);
+      slots[c] = find_slot(level, plane, i + (c & 1), j + (c >> 1), table.probe, table.capacity,
+                           table.brick_keys, table.masks);
     return;
   }
-  const int32_t number = find_brick(level, plane, i >> kBrickBits, j >> kBrickBits, table.probe, table.capacity,
-                                    table.brick_keys);
+  const int32_t number = find_brick(level, plane, i >> kBrickBits, j >> kBrickBits, table.probe,
+                                    table.capacity, table.brick_keys);
   for (int c = 0; c < kCorners; ++c) {
     const int local = local_of(i + (c & 1), j + (c >> 1));
     const bool exists = number >= 0 && (table.masks[number] >> local & 1) != 0;

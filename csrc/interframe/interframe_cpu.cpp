@@ -22,7 +22,8 @@ Sample<T> sample(const uint8_t* image, int width, T u, T v) {
   const int column = static_cast<int>(std::floor(u)), row = static_cast<int>(std::floor(v));
   const T p = u - T(column), q = v - T(row);
   const auto pixel = [&](int r, int c) -> Vector3<T> {
-    const Eigen::Map<const Eigen::Matrix<uint8_t, 3, 1>> rgb(image + (static_cast<int64_t>(r) * width + c) * 3);
+    const Eigen::Map<const Eigen::Matrix<uint8_t, 3, 1>> rgb(image +
+                                                             (static_cast<int64_t>(r) * width + c) * 3);
     return rgb.template cast<T>() / T(255);
   };
   const Vector3<T> c00 = pixel(row, column), c10 = pixel(row, column + 1), c01 = pixel(row + 1, column),
@@ -71,9 +72,9 @@ void interframe(const T* points_c, const T* color, const T* T_kc, const uint8_t*
   }
 }
 
-template void interframe(const float*, const float*, const float*, const uint8_t*, int, int, const Pinhole<float>&,
-                         int64_t, float*, float*, bool*);
-template void interframe(const double*, const double*, const double*, const uint8_t*, int, int, const Pinhole<double>&,
-                         int64_t, double*, double*, bool*);
+template void interframe(const float*, const float*, const float*, const uint8_t*, int, int,
+                         const Pinhole<float>&, int64_t, float*, float*, bool*);
+template void interframe(const double*, const double*, const double*, const uint8_t*, int, int,
+                         const Pinhole<double>&, int64_t, double*, double*, bool*);
 
 }  // namespace snh::cpu

@@ -6,8 +6,9 @@
 
 namespace snh {
 
-static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, const Tensor& color, const Tensor& T_kc,
-                                                     const Tensor& image, double fx, double fy, double cx, double cy) {
+static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, const Tensor& color,
+                                                     const Tensor& T_kc, const Tensor& image, double fx,
+                                                     double fy, double cx, double cy) {
   constexpr const char* kOp = "interframe";
   check_floating(kOp, "points_c", points_c);
   check_dtype(kOp, "color", color, points_c.scalar_type());
@@ -27,9 +28,9 @@ static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, con
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     const Pinhole<T> pinhole{static_cast<T>(fx), static_cast<T>(fy), static_cast<T>(cx), static_cast<T>(cy)};
-    cpu::interframe<T>(in<T>(points), in<T>(c), in<T>(pose), in<uint8_t>(pixels), static_cast<int>(pixels.size(0)),
-                       static_cast<int>(pixels.size(1)), pinhole, n_rays, out<T>(residuals), out<T>(jacobian),
-                       out<bool>(valid));
+    cpu::interframe<T>(in<T>(points), in<T>(c), in<T>(pose), in<uint8_t>(pixels),
+                       static_cast<int>(pixels.size(0)), static_cast<int>(pixels.size(1)), pinhole, n_rays,
+                       out<T>(residuals), out<T>(jacobian), out<bool>(valid));
   };
   points.scalar_type() == ScalarType::Float ? call(0.0f) : call(0.0);
   return {residuals, jacobian, valid};
@@ -39,7 +40,7 @@ static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, con
 
 STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
   m.def(
-      "interframe(Tensor points_c, Tensor color, Tensor T_kc, Tensor image, float fx, float fy, float cx, float cy) "
-      "-> (Tensor, Tensor, Tensor)");
+      "interframe(Tensor points_c, Tensor color, Tensor T_kc, Tensor image, float fx, float fy, float cx, "
+      "float cy) -> (Tensor, Tensor, Tensor)");
 }
 STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) { m.impl("interframe", TORCH_BOX(&snh::interframe)); }

@@ -58,8 +58,9 @@ void plane_lookup_backward(const PlaneLookup<T>& in, const T* grad_encoded, cons
 // v_features [V, C]: null counts as zero.
 template <typename T>
 void plane_lookup_double_backward(const PlaneLookup<T>& in, const T* grad_encoded, const T* v_points,
-                                  const T* v_features, const ParallelFor& over_points, const ParallelFor& over_levels,
-                                  T* grad_grad_encoded, T* grad_points, T* grad_features);
+                                  const T* v_features, const ParallelFor& over_points,
+                                  const ParallelFor& over_levels, T* grad_grad_encoded, T* grad_points,
+                                  T* grad_features);
 
 }  // namespace cpu
 }  // namespace snh

@@ -154,7 +154,8 @@ struct FirstOrder : View<T, F> {
       const Cell<T>& cell = this->cell[plane];
       for (int c = 0; c < kCorners; ++c)
         if (cell.slot[c] >= 0)
-          Feature<T, F>(grad_features + cell.slot[c] * this->in.stride, this->in.n_features) += cell.b[c] * alpha.col(plane);
+          Feature<T, F>(grad_features + cell.slot[c] * this->in.stride, this->in.n_features) +=
+              cell.b[c] * alpha.col(plane);
     }
   }
 
@@ -196,16 +197,18 @@ struct SecondOrder : FirstOrder<T, F> {
     if (this->in.reduce != Reduce::kProd) return reduce_planes(phi_dot, this->in.reduce, e_dot);
     const Planes<T, F>& phi = this->phi;
     Feature<T, F>(e_dot, phi.rows()) = phi_dot.col(0) * phi.col(1) * phi.col(2) +
-                                    phi_dot.col(1) * phi.col(2) * phi.col(0) +
-                                    phi_dot.col(2) * phi.col(0) * phi.col(1);
+                                       phi_dot.col(1) * phi.col(2) * phi.col(0) +
+                                       phi_dot.col(2) * phi.col(0) * phi.col(1);
   }
   void add_to_point(T* grad_point) const {
     for (int plane = 0; plane < kPlanes; ++plane) {
       const Cell<T>& cell = this->cell[plane];
       const Rows<T, F>&f = this->rows[plane], &f_dot = rows_dot[plane];
       const auto a = this->alpha.col(plane).matrix(), b = beta.col(plane).matrix();
-      grad_point[axis_u(plane)] += a.dot(f * (cell.b_uv * v_dot[plane]) + f_dot * cell.b_u) + b.dot(f * cell.b_u);
-      grad_point[axis_v(plane)] += a.dot(f * (cell.b_uv * u_dot[plane]) + f_dot * cell.b_v) + b.dot(f * cell.b_v);
+      grad_point[axis_u(plane)] +=
+          a.dot(f * (cell.b_uv * v_dot[plane]) + f_dot * cell.b_u) + b.dot(f * cell.b_u);
+      grad_point[axis_v(plane)] +=
+          a.dot(f * (cell.b_uv * u_dot[plane]) + f_dot * cell.b_v) + b.dot(f * cell.b_v);
     }
   }
   void add_to_features(T* grad_features) const {
@@ -261,30 +264,34 @@ void plane_lookup_backward(const PlaneLookup<T>& in, const T* grad_encoded, cons
   with_features(in, [&](auto n_features) {
     const FirstOrder<T, n_features> first(in, grad_encoded);
     if (grad_points)
-      by_points(first, over_points, [&](const auto& at, int64_t n, int) { at.add_to_point(grad_points + n * 3); });
-    if (grad_features) by_levels(first, over_levels, [&](const auto& at) { at.add_to_features(grad_features); });
+      by_points(first, over_points,
+                [&](const auto& at, int64_t n, int) { at.add_to_point(grad_points + n * 3); });
+    if (grad_features)
+      by_levels(first, over_levels, [&](const auto& at) { at.add_to_features(grad_features); });
   });
 }
 
 template <typename T>
 void plane_lookup_double_backward(const PlaneLookup<T>& in, const T* grad_encoded, const T* v_points,
-                                  const T* v_features, const ParallelFor& over_points, const ParallelFor& over_levels,
-                                  T* grad_grad_encoded, T* grad_points, T* grad_features) {
+                                  const T* v_features, const ParallelFor& over_points,
+                                  const ParallelFor& over_levels, T* grad_grad_encoded, T* grad_points,
+                                  T* grad_features) {
   with_features(in, [&](auto n_features) {
     const SecondOrder<T, n_features> second(in, grad_encoded, v_points, v_features);
     by_points(second, over_points, [&](const auto& at, int64_t n, int level) {
       at.write_encoded(grad_grad_encoded + row_begin(in, n, level));
       at.add_to_point(grad_points + n * 3);
     });
-    if (grad_features) by_levels(second, over_levels, [&](const auto& at) { at.add_to_features(grad_features); });
+    if (grad_features)
+      by_levels(second, over_levels, [&](const auto& at) { at.add_to_features(grad_features); });
   });
 }
 
-#define SNH_INSTANTIATE(T)                                                                                   \
-  template void plane_lookup(const PlaneLookup<T>&, const ParallelFor&, T*, bool*);                          \
-  template void plane_lookup_backward(const PlaneLookup<T>&, const T*, const ParallelFor&,                   \
-                                      const ParallelFor&, T*, T*);                                           \
-  template void plane_lookup_double_backward(const PlaneLookup<T>&, const T*, const T*, const T*,            \
+#define SNH_INSTANTIATE(T)                                                                        \
+  template void plane_lookup(const PlaneLookup<T>&, const ParallelFor&, T*, bool*);               \
+  template void plane_lookup_backward(const PlaneLookup<T>&, const T*, const ParallelFor&,        \
+                                      const ParallelFor&, T*, T*);                                \
+  template void plane_lookup_double_backward(const PlaneLookup<T>&, const T*, const T*, const T*, \
                                              const ParallelFor&, const ParallelFor&, T*, T*, T*);
 SNH_INSTANTIATE(float)
 SNH_INSTANTIATE(double)

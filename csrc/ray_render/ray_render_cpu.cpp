@@ -19,8 +19,8 @@ using Out = Eigen::Map<T>;
 }  // namespace
 
 template <typename T>
-void ray_render(const T* tsdf, const T* color, const T* z, int64_t n_rays, int n_samples, T sharpness, T cut_behind,
-                const ParallelFor& over_rays, T* color_ray, T* depth_ray, T* weight) {
+void ray_render(const T* tsdf, const T* color, const T* z, int64_t n_rays, int n_samples, T sharpness,
+                T cut_behind, const ParallelFor& over_rays, T* color_ray, T* depth_ray, T* weight) {
   const auto render = [&](int64_t r) {
     const In<Row<T>> s(tsdf + r * n_samples, n_samples), z_i(z + r * n_samples, n_samples);
     const In<Colors<T>> c(color + r * n_samples * 3, n_samples, 3);
@@ -40,9 +40,10 @@ void ray_render(const T* tsdf, const T* color, const T* z, int64_t n_rays, int n
 
 // The formulas and their derivation stand in the header.
 template <typename T>
-void ray_render_backward(const T* grad_color_ray, const T* grad_depth_ray, const T* grad_weight, const T* tsdf,
-                         const T* color, const T* z, const T* weight, int64_t n_rays, int n_samples, T sharpness,
-                         const ParallelFor& over_rays, T* grad_tsdf, T* grad_color, T* grad_z) {
+void ray_render_backward(const T* grad_color_ray, const T* grad_depth_ray, const T* grad_weight,
+                         const T* tsdf, const T* color, const T* z, const T* weight, int64_t n_rays,
+                         int n_samples, T sharpness, const ParallelFor& over_rays, T* grad_tsdf,
+                         T* grad_color, T* grad_z) {
   const auto backward = [&](int64_t r) {
     const In<Row<T>> s(tsdf + r * n_samples, n_samples), z_i(z + r * n_samples, n_samples),
         p(weight + r * n_samples, n_samples), dp(grad_weight + r * n_samples, n_samples);
@@ -52,7 +53,8 @@ void ray_render_backward(const T* grad_color_ray, const T* grad_depth_ray, const
 
     const Row<T> g = dp + (c.matrix() * dc.matrix().transpose()).array() + z_i * dz;
     const T g_mean = (p * g).sum();
-    Out<Row<T>>(grad_tsdf + r * n_samples, n_samples) = -sharpness * (s * (sharpness / 2)).tanh() * p * (g - g_mean);
+    Out<Row<T>>(grad_tsdf + r * n_samples, n_samples) =
+        -sharpness * (s * (sharpness / 2)).tanh() * p * (g - g_mean);
     Out<Colors<T>>(grad_color + r * n_samples * 3, n_samples, 3) = (p.matrix() * dc.matrix()).array();
     Out<Row<T>>(grad_z + r * n_samples, n_samples) = p * dz;
   };
@@ -61,10 +63,11 @@ void ray_render_backward(const T* grad_color_ray, const T* grad_depth_ray, const
   });
 }
 
-#define SNH_INSTANTIATE(T)                                                                                           \
-  template void ray_render(const T*, const T*, const T*, int64_t, int, T, T, const ParallelFor&, T*, T*, T*);        \
-  template void ray_render_backward(const T*, const T*, const T*, const T*, const T*, const T*, const T*, int64_t,   \
-                                    int, T, const ParallelFor&, T*, T*, T*);
+#define SNH_INSTANTIATE(T)                                                                                \
+  template void ray_render(const T*, const T*, const T*, int64_t, int, T, T, const ParallelFor&, T*, T*,  \
+                           T*);                                                                           \
+  template void ray_render_backward(const T*, const T*, const T*, const T*, const T*, const T*, const T*, \
+                                    int64_t, int, T, const ParallelFor&, T*, T*, T*);
 SNH_INSTANTIATE(float)
 SNH_INSTANTIATE(double)
 #undef SNH_INSTANTIATE

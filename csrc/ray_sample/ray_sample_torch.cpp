@@ -8,7 +8,8 @@ static Tensor ray_sample(const Tensor& depth, const Tensor& uniforms, int64_t n_
                          double near, double far, double truncation) {
   constexpr const char* kOp = "ray_sample";
   STD_TORCH_CHECK(n_base >= 0, "snh::ray_sample: argument 'n_base' must be at least 0, got ", n_base);
-  STD_TORCH_CHECK(n_surface >= 0, "snh::ray_sample: argument 'n_surface' must be at least 0, got ", n_surface);
+  STD_TORCH_CHECK(n_surface >= 0, "snh::ray_sample: argument 'n_surface' must be at least 0, got ",
+                  n_surface);
   check_floating(kOp, "depth", depth);
   check_dtype(kOp, "uniforms", uniforms, depth.scalar_type());
   check_shape(kOp, "depth", depth, {-1});

@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from snh.ops._library import native
-
-
-class Table(Protocol):
-    """What a look-up needs of a table: `snh.ops.HashTable` has it."""
-
-    @property
-    def probe(self) -> Tensor: ...  # [capacity] int32
-    @property
-    def brick_keys(self) -> Tensor: ...  # [B] int64
-    @property
-    def masks(self) -> Tensor: ...  # [B] int64
+from snh.ops.hash_table import HashTable
 
 
 def plane_lookup(
     points: Tensor,  # [N, 3] m, world
     features: Tensor,  # [V, C], V >= 64 B
-    table: Table,
+    table: HashTable,
     cell_sizes: Sequence[float],  # L, m; level 0 = finest
     n_features: int = 3,  # F <= C
     reduce: str = "sum",
