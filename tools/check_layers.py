@@ -18,8 +18,8 @@ LAYERS = [
     {"config", "geometry", "frame", "files"},
     {"_core"},  # the native library without torch
     {"ops"},
-    {"nn", "datasets"},
-    {"slam", "mesh", "eval", "viz"},
+    {"nn", "datasets", "mesh"},
+    {"slam", "eval", "viz"},
     {"run"},  # a whole run with its files
     {"cli"},
     {"", "__main__"},  # snh/__init__.py hands out the public names
