@@ -1,7 +1,9 @@
-# make demo    run SLAM on the built-in scene: trajectory, mesh, pictures and a table under outputs/
-# make test    lint, then all tests          make lint   format, types, import layers
+# make demo    SLAM on the built-in scene: trajectory, mesh, pictures and a table under outputs/
+# make test    lint, then all tests
+# make lint    format, types, import layers             make format  rewrite the sources in that format
 # make asan    the op tests under AddressSanitizer and UBSan
-# make build   native parts in place         make wheel  dist/*.whl        make clean   remove what was built
+# make build   native parts in place                    make wheel   dist/*.whl
+# make clean   remove what was built; .venv stays
 #
 # Each sets up .venv in this folder first and reuses what stands. Variables:
 #   PYTHON=python3.12       interpreter for .venv, 3.10 or newer
@@ -14,11 +16,11 @@ CXX ?= c++
 ARGS ?=
 NATIVE_SOURCES := CMakeLists.txt setup.py $(wildcard csrc/*/*)
 FORMATTED := $(wildcard csrc/*/*.h csrc/*/*.cpp csrc/*/*.cu csrc/*/*.cuh tests/cpp/*.cpp)
-OP_TESTS := $(wildcard $(patsubst csrc/%,tests/test_%.py,$(wildcard csrc/*)))
+OP_TESTS := $(wildcard $(patsubst csrc/%,tests/test_%*.py,$(wildcard csrc/*)))
 export PYTHON TORCH SNH_CUDA
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint asan build wheel clean
+.PHONY: demo test lint format asan build wheel clean
 READY := build/.native $(VENV)/.installed
 
 demo: $(READY)
@@ -32,10 +34,14 @@ test: lint
 lint: $(READY)
 	@echo "== lint: ruff, clang-format, mypy, import layers"
 	@$(BIN)/ruff check --quiet .
-	@$(BIN)/ruff format --quiet --check .
-	@$(BIN)/clang-format --dry-run -Werror $(FORMATTED)
+	@$(BIN)/ruff format --quiet --check . && $(BIN)/clang-format --dry-run -Werror $(FORMATTED) || \
+	  { echo "not formatted; run: make format"; exit 1; }
 	@$(BIN)/mypy --no-error-summary
 	@$(BIN)/python tools/check_layers.py
+
+format: $(READY)
+	@$(BIN)/ruff format --quiet .
+	@$(BIN)/clang-format -i $(FORMATTED)
 
 # A second copy of the package with instrumented libraries; PYTHONPATH puts it before the one in .venv. The runtime
 # libraries must be the first that the interpreter loads. Leaks are not counted: Python keeps objects until it exits.

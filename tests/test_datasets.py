@@ -184,6 +184,9 @@ def test_associate_by_hand() -> None:
     assert associate(color, depth, 0.02) == [(0, 0), (1, 1), (2, 2)]
     assert associate(color, depth, 0.012) == [(1, 1), (2, 2)]
     assert associate(color, depth[:0], 0.02) == []
+    # 0.03 and 0.018 (12 ms) come before 0.00 and 0.018 (18 ms) and 0.03 and 0.049 (19 ms), which then have no partner.
+    assert associate(np.array([0.00, 0.03]), np.array([0.018, 0.049]), 0.02) == [(1, 0)]
+    assert associate(np.array([0.000, 0.011]), np.array([0.005]), 0.02) == [(0, 0)]
 
 
 def test_tum_largest_difference_of_times(tmp_path: Path) -> None:
@@ -198,10 +201,10 @@ def test_tum_poses_missing_for_some_frames(tmp_path: Path) -> None:
     folder = write_tum_with_camera(tmp_path / "r", make_shots(4))
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     time = lines[4].split()[0]
-    (folder / "groundtruth.txt").write_text("\n".join([*lines[:4], f"{time} nan nan nan 0 0 0 1", lines[6]]))
+    (folder / "groundtruth.txt").write_text("\n".join([*lines[:4], f"{time} nan nan nan 0 0 0 1", lines[5]]))
     reference = open_sequence(folder).reference()
     assert reference is not None
-    assert list(np.isfinite(reference).all(axis=(1, 2))) == [True, False, False, True]
+    assert list(np.isfinite(reference).all(axis=(1, 2))) == [True, False, True, False]
 
 
 @pytest.mark.parametrize(
@@ -231,10 +234,12 @@ def test_tum_cameras_by_name(tmp_path: Path, name: str, fx: float) -> None:
 # --- registration
 
 
-def test_registration_of_a_known_offset(tmp_path: Path) -> None:
+@pytest.mark.parametrize("apart", [True, False])
+def test_registration_of_a_known_offset(tmp_path: Path, apart: bool) -> None:
     """A wall at 2 m whose colour is a smooth function of its own x and y, seen by a turned and shifted camera."""
     depth_camera, color_camera = Camera(320, 240, 290, 290, 160, 120), Camera(320, 240, 255, 260, 158, 119)
     T_color_depth = se3_exp(np.array([-0.05, 0.02, 0.01, 0.01, -0.12, 0.015]))
+    T_color_depth[:3, 3] *= apart
     T_depth_color = np.linalg.inv(T_color_depth)
 
     def wall_color(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -351,6 +356,14 @@ def test_resize_then_crop_keep_the_geometry(tmp_path: Path) -> None:
     # Tripled images repeat each reading for 3 pixels: their centre has it exactly, the neighbours are 1/3 pixel off.
     centre = points[:, (1 - 10) % 3 :: 3]
     assert np.abs(centre[..., 2] - 1 - a * centre[..., 0]).max() < 0.0011  # depth is stored in mm
+
+
+def test_resize_invents_no_depth_between_two_surfaces(tmp_path: Path) -> None:
+    shot = make_shots(1)[0]
+    depth = np.where(np.arange(64) < 31, 1, 3).astype(np.float32)[None].repeat(48, 0)
+    folder = write_7scenes(tmp_path / "r", [replace(shot, depth=depth)] * 2)
+    for size in ((32, 24), (40, 30), (128, 96)):
+        assert set(np.unique(open_sequence(folder, resize=size)[0].depth).round(3)) == {1, 3}
 
 
 def test_depth_limit_and_saturation(tmp_path: Path) -> None:
@@ -595,11 +608,21 @@ def test_damaged_pose_files(tmp_path: Path) -> None:
     check(open_sequence(folder))
 
 
-@pytest.mark.parametrize("keep, sentence", [(0, "truncated"), (200, "truncated"), (-200, "truncated")])
-def test_truncated_sens(tmp_path: Path, keep: int, sentence: str) -> None:
+@pytest.mark.parametrize("keep", [0, 200, 400, -200])
+def test_truncated_sens(tmp_path: Path, keep: int) -> None:
     path = write_sens(tmp_path / "scene.sens", make_shots(3))
     path.write_bytes(path.read_bytes()[:keep])
-    refuse(path, sentence)
+    with pytest.raises(DataError, match="is truncated or cannot be read"):
+        open_sequence(path)
+
+
+def test_sens_pose_with_an_infinite_number(tmp_path: Path) -> None:
+    shots = make_shots(3)
+    shots[1].T_wc[0, 3] = -np.inf
+    sequence = open_sequence(write_sens(tmp_path / "scene.sens", shots))
+    reference = sequence.reference()
+    assert reference is not None and sequence[1].T_wc_ref is None
+    assert np.isnan(reference[1]).all() and np.isfinite(reference[[0, 2]]).all()
 
 
 def test_damaged_sens_frame(tmp_path: Path) -> None:

@@ -15,11 +15,12 @@ PACKAGE = Path(__file__).resolve().parent.parent / "snh"
 # Lowest first. A part may import parts of lower layers only; those of one layer do not know each other.
 LAYERS = [
     {"errors"},
-    {"config", "geometry", "frame"},
+    {"config", "geometry", "frame", "files"},
     {"_core"},  # the native library without torch
     {"ops"},
-    {"nn", "datasets"},
-    {"slam", "mesh", "eval", "viz"},
+    {"nn", "datasets", "mesh"},
+    {"slam", "eval", "viz"},
+    {"run"},  # a whole run with its files
     {"cli"},
     {"", "__main__"},  # snh/__init__.py hands out the public names
 ]
@@ -32,7 +33,7 @@ CONFINED = {
     "open3d": {"mesh", "eval", "viz"},
     "trimesh": {"mesh", "eval", "viz"},
     "matplotlib": {"viz"},
-    "torch": {"ops", "nn", "slam", "mesh", "eval", "cli"},
+    "torch": {"ops", "nn", "slam", "mesh", "eval", "viz", "run"},
 }
 
 

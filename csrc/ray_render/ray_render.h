@@ -29,6 +29,7 @@
 #include <limits>
 
 #include "common/hd.h"
+#include "common/parallel.h"
 
 namespace snh {
 
@@ -54,14 +55,15 @@ namespace cpu {
 
 template <typename T>
 void ray_render(const T* tsdf, const T* color, const T* z, int64_t n_rays, int n_samples, T sharpness,
-                T cut_behind, T* color_ray, T* depth_ray, T* weight);
+                T cut_behind, const ParallelFor& over_rays, T* color_ray, T* depth_ray, T* weight);
 
-// weight is the forward's output; grad_weight [R, S], grad_color_ray [R, 3], grad_depth_ray [R] come in, the
-// other gradients go out.
+// grad_color_ray [R, 3], grad_depth_ray [R], grad_weight [R, S] and the forward's weight come in; grad_tsdf [R, S],
+// grad_color [R, S, 3], grad_z [R, S] are written.
 template <typename T>
 void ray_render_backward(const T* grad_color_ray, const T* grad_depth_ray, const T* grad_weight,
                          const T* tsdf, const T* color, const T* z, const T* weight, int64_t n_rays,
-                         int n_samples, T sharpness, T* grad_tsdf, T* grad_color, T* grad_z);
+                         int n_samples, T sharpness, const ParallelFor& over_rays, T* grad_tsdf,
+                         T* grad_color, T* grad_z);
 
 }  // namespace cpu
 }  // namespace snh

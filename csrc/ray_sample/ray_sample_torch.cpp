@@ -7,6 +7,9 @@ namespace snh {
 static Tensor ray_sample(const Tensor& depth, const Tensor& uniforms, int64_t n_base, int64_t n_surface,
                          double near, double far, double truncation) {
   constexpr const char* kOp = "ray_sample";
+  STD_TORCH_CHECK(n_base >= 0, "snh::ray_sample: argument 'n_base' must be at least 0, got ", n_base);
+  STD_TORCH_CHECK(n_surface >= 0, "snh::ray_sample: argument 'n_surface' must be at least 0, got ",
+                  n_surface);
   check_floating(kOp, "depth", depth);
   check_dtype(kOp, "uniforms", uniforms, depth.scalar_type());
   check_shape(kOp, "depth", depth, {-1});

@@ -13,7 +13,8 @@ from snh.mesh.mesh import Mesh
 from snh.mesh.raycast import RayScene
 
 _OCCLUSION_RADIUS = 0.4  # m, reach of the contact shadows
-_OCCLUSION_RAYS = 4  # per ray of the picture; with 2 x 2 rays per pixel, 16 per pixel
+_OCCLUSION_RAYS = 4  # per ray of the picture; their mean over a window of rays on the same surface is smooth
+_OCCLUSION_WINDOW = 3  # rays to each side
 _OCCLUSION_DEPTH = 0.75  # how much of its light a fully closed corner loses
 
 
@@ -57,10 +58,12 @@ def _shade(mesh: Mesh, camera: Camera, T_wc: np.ndarray, contact_shadows: bool, 
     view = -directions[hit] / np.linalg.norm(directions[hit], axis=-1, keepdims=True)
     cosine = np.sum(normal * view, axis=-1, keepdims=True)
     normal = np.where(cosine < 0, -normal, normal)
-    light = 0.72 + 0.28 * np.abs(cosine)
+    light = np.zeros(hit.shape, dtype=np.float32)
+    light[hit] = 1
     if contact_shadows:
-        light = light * (1 - _OCCLUSION_DEPTH * _closedness(scene, points, normal))[:, None]
-    image[hit] = color * light
+        light[hit] -= _OCCLUSION_DEPTH * _closedness(scene, points, normal)
+        light = _smooth(light, np.where(hit, hits.t, 0))
+    image[hit] = color * (0.72 + 0.28 * np.abs(cosine)) * light[hit][:, None]
 
 
 def _closedness(scene: RayScene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -75,6 +78,20 @@ def _closedness(scene: RayScene, points: np.ndarray, normals: np.ndarray) -> np.
         reach = scene.cast(points + 0.01 * normals, direction).t
         closed += np.clip(1 - reach / _OCCLUSION_RADIUS, 0, 1)
     return closed / _OCCLUSION_RAYS
+
+
+def _smooth(light: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Mean of `light` [H, W] over a window, along rows and then columns, within surfaces of like `depth` [H, W]."""
+    reach = _OCCLUSION_WINDOW
+    for axis in (0, 1):
+        total, count = np.zeros_like(light), np.zeros_like(light)
+        for step in range(-reach, reach + 1):
+            other_depth = np.roll(depth, step, axis)
+            same = np.abs(other_depth - depth) < 0.01 * depth
+            total += np.where(same, np.roll(light, step, axis), 0)
+            count += same
+        light = total / np.maximum(count, 1)
+    return light
 
 
 def save_png(path: str | Path, image: np.ndarray) -> None:
