@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from snh.datasets.poses import read_tum
+from snh.datasets.tum import associate
 from snh.errors import DataError, OutputError
-from snh.eval import align, associate, ate, read_tum, rpe, write_tum
+from snh.eval import align, ate, rpe, write_tum
 from snh.geometry import inverse, se3_exp
 
 
@@ -97,14 +99,6 @@ def test_relative_error_by_hand():
     assert error.n_pairs == 10
 
 
-def test_association_takes_nearest_pairs_once():
-    times, times_ref = np.array([0.0, 0.10, 0.105, 0.2, 5.0]), np.array([0.201, 0.099, 0.012, 3.0])
-    i, j = associate(times, times_ref, max_difference=0.02)
-    assert i.tolist() == [0, 1, 3] and j.tolist() == [2, 1, 0]
-    i, j = associate(times, np.zeros(0))
-    assert len(i) == len(j) == 0
-
-
 def test_tum_file_gives_back_the_path(tmp_path):
     T, times = random_path(20), 1305031102.175304 + np.arange(20) / 30
     write_tum(tmp_path / "trajectory.txt", times, T)
@@ -114,22 +108,9 @@ def test_tum_file_gives_back_the_path(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["trajectory.txt"]
 
 
-def test_tum_files_refuse_in_one_sentence(tmp_path):
+def test_tum_file_that_cannot_be_written_is_refused(tmp_path):
     with pytest.raises(OutputError, match="No such file"):
         write_tum(tmp_path / "missing" / "a.txt", np.zeros(1), np.eye(4)[None])
-    with pytest.raises(DataError, match="Cannot read"):
-        read_tum(tmp_path / "a.txt")
-    for text in ("0 1 2 3", "0 0 0 0 0 0 zero 1"):
-        (tmp_path / "a.txt").write_text(f"# a comment\n{text}\n")
-        with pytest.raises(DataError, match="line 2: expected"):
-            read_tum(tmp_path / "a.txt")
-
-
-def test_tum_file_with_invalid_poses_is_read(tmp_path):
-    (tmp_path / "a.txt").write_text("0 nan nan nan nan nan nan nan\n1 0 0 0 0 0 0 0\n2 1 2 3 0 0 0 1\n")
-    _, T = read_tum(tmp_path / "a.txt")
-    assert np.isfinite(T).all(axis=(1, 2)).tolist() == [False, False, True]
-    assert T[2, :3, 3].tolist() == [1, 2, 3]
 
 
 def test_agrees_with_evo_on_a_real_path(shared_data, tmp_path, monkeypatch):
@@ -152,7 +133,7 @@ def test_agrees_with_evo_on_a_real_path(shared_data, tmp_path, monkeypatch):
         oracle.append(metric.get_all_statistics())
 
     (times_ref, T_ref), (times, T_est) = (read_tum(file) for file in files)
-    i, j = associate(times, times_ref)
+    i, j = np.array(associate(times, times_ref, 0.02)).T
     assert len(i) == reference.num_poses == 786
     absolute, relative = ate(T_est[i], T_ref[j]), rpe(T_est[i], T_ref[j])
     for ours, theirs in (

@@ -1,4 +1,4 @@
-"""Errors of a camera path against a reference, and the TUM file of a path."""
+"""Errors of a camera path against a reference, and the TUM file of a path (read by snh.datasets.poses.read_tum)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from snh.errors import DataError
 from snh.files import write_atomically
-from snh.geometry import inverse, quaternion_from_rotation, rotation_from_quaternion
+from snh.geometry import inverse, quaternion_from_rotation
 
 
 @dataclass(frozen=True)
@@ -111,27 +111,6 @@ def _rotation_angle(R: np.ndarray) -> np.ndarray:
     return np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(R, axis1=1, axis2=2) - 1)
 
 
-def associate(times: np.ndarray, times_ref: np.ndarray, max_difference: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
-    """Index pairs (i [P], j [P]), ascending, of times nearer than `max_difference` s; each time at most once,
-    nearest pairs first."""
-    order = np.argsort(times_ref, kind="stable")
-    place = np.searchsorted(times_ref[order], times)
-    reach = np.arange(-3, 3)
-    i = np.repeat(np.arange(len(times)), len(reach))
-    at = (place[:, None] + reach).ravel()
-    inside = (at >= 0) & (at < len(times_ref))
-    i, j = i[inside], order[at[inside]]
-    difference = np.abs(times[i] - times_ref[j])
-    free, free_ref = np.ones(len(times), dtype=bool), np.ones(len(times_ref), dtype=bool)
-    pairs = []
-    for k in np.argsort(difference, kind="stable"):
-        if difference[k] < max_difference and free[i[k]] and free_ref[j[k]]:
-            free[i[k]] = free_ref[j[k]] = False
-            pairs.append((i[k], j[k]))
-    found = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
-    return found[:, 0], found[:, 1]
-
-
 def write_tum(path: str | Path, timestamps: np.ndarray, T_wc: np.ndarray) -> None:
     """Write poses [N, 4, 4] at `timestamps` [N] s as lines `timestamp tx ty tz qx qy qz qw`, atomically.
 
@@ -142,35 +121,3 @@ def write_tum(path: str | Path, timestamps: np.ndarray, T_wc: np.ndarray) -> Non
         numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
         lines.append(f"{timestamp:.6f} " + " ".join(f"{value:.9f}" for value in numbers))
     write_atomically(path, ("\n".join(lines) + "\n").encode())
-
-
-def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """(timestamps [N] s, T_wc [N, 4, 4] float64) of a TUM file; a line without a valid quaternion gives a NaN pose.
-
-    Raises DataError, with the line, when the file is missing or a line is not eight numbers.
-    """
-    path = Path(path)
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"Cannot read the trajectory {path}: {error}.") from error
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            rows.append([float(word) for word in words])
-        except ValueError:
-            rows.append([])
-        if len(rows[-1]) != 8:
-            raise DataError(
-                f"{path}, line {number}: expected `timestamp tx ty tz qx qy qz qw`, found {line.strip()!r}."
-            )
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    T_wc = np.tile(np.eye(4), (len(table), 1, 1))
-    T_wc[:, :3, 3] = table[:, 1:4]
-    for T, q in zip(T_wc, table[:, 4:], strict=True):
-        norm = np.linalg.norm(q)
-        T[:3, :3] = rotation_from_quaternion(q) if 0 < norm < np.inf else np.nan
-    return table[:, 0], T_wc
