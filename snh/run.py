@@ -24,10 +24,11 @@ from snh.eval.reconstruction import evaluate_reconstruction
 from snh.eval.trajectory import ate, write_tum
 from snh.files import write_atomically
 from snh.mesh import Mesh, candidate_blocks, extract_mesh, save_mesh
+from snh.mesh.views import dollhouse_view, up_direction
 from snh.nn import SceneField
 from snh.slam import SLAM
 from snh.slam.map_file import load_map, save_map
-from snh.viz import dollhouse_view, draw_path, render_mesh, save_png, up_direction
+from snh.viz import path_picture, render_mesh, save_png
 
 
 @dataclass
@@ -111,7 +112,8 @@ def track_sequence(sequence: Sequence, config: Config, seed: int, threads: int |
     torch.set_num_threads(threads or os.cpu_count() or 1)
     run = Run(SLAM(sequence.camera, config, seed))
     previous = _on_interrupt(run)
-    bar = tqdm(total=len(sequence), unit="frame", disable=quiet, dynamic_ncols=True)
+    interval = 0.2 if sys.stderr.isatty() else 10.0  # s; a log file gets few lines
+    bar = tqdm(total=len(sequence), unit="frame", disable=quiet, dynamic_ncols=True, mininterval=interval)
     start = time.perf_counter()
     try:
         for item in prefetch(sequence, range(len(sequence))):
@@ -194,12 +196,22 @@ def mesh_of(field: SceneField, voxel: float) -> Mesh:
     spec, table = field.spec, field.table
 
     def query(points: np.ndarray, with_color: bool):
-        return ops.field_query(
+        answer = ops.field_query(
             torch.from_numpy(points), field.features.detach(), table, field.decoder.weight.detach(), spec, with_color
         )
+        return tuple(tensor.numpy() for tensor in answer)
 
     blocks = candidate_blocks(table.brick_keys.numpy(), spec.cell_sizes[0], voxel)
     return extract_mesh(query, blocks, voxel, spec.truncation)
+
+
+def draw_path(path: Path, T_wc: np.ndarray, T_ref: np.ndarray | None) -> None:
+    """The path from above and, with a reference, its error per frame."""
+    if T_ref is None or not np.isfinite(T_ref).all(axis=(1, 2)).any():
+        save_png(path, path_picture(T_wc))
+    else:
+        error = ate(T_wc, T_ref)
+        save_png(path, path_picture(error.T_ref_est @ T_wc, T_ref, error.errors_cm))
 
 
 def draw_mesh(path: Path, mesh: Mesh, T_wc: np.ndarray) -> None:
