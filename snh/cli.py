@@ -78,11 +78,13 @@ def _run_options(parser: argparse.ArgumentParser, out: str | None = None, frames
 
 def _input_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("input")
-    group.add_argument("--format", default="auto", help="auto, 7scenes, replica, tum, scannet, folder (default: auto)")
+    group.add_argument("--format", default="auto", help="auto, 7scenes, replica, tum, scannet, generic (default: auto)")
     group.add_argument("--start", type=int, help="first frame")
     group.add_argument("--stride", type=int, help="use every n-th frame")
-    group.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="pinhole camera, pixels")
+    group.add_argument("--intrinsics", metavar="FX,FY,CX,CY|FILE", help="pinhole camera, pixels, or a calibration file")
     group.add_argument("--depth-scale", type=float, help="depth image units per metre")
+    group.add_argument("--depth-max", type=float, help="ignore readings beyond so many metres")
+    group.add_argument("--max-time-difference", type=float, help="seconds between colour and depth of a pair (TUM)")
     group.add_argument("--resize", metavar="WxH", help="resize the images")
     group.add_argument("--crop", type=int, help="cut this many pixels from each side")
 
@@ -90,22 +92,14 @@ def _input_options(parser: argparse.ArgumentParser) -> None:
 def _sequence(a: argparse.Namespace):
     from snh.datasets import open_sequence
 
-    options = {"start": a.start, "stride": a.stride, "depth_scale": a.depth_scale, "crop": a.crop, "frames": a.frames}
-    if a.intrinsics:
-        options["intrinsics"] = _numbers(a.intrinsics, ",", 4, "--intrinsics", "FX,FY,CX,CY")
+    names = ("start", "stride", "frames", "crop", "intrinsics", "depth_scale", "depth_max", "max_time_difference")
+    options = {name: getattr(a, name) for name in names if getattr(a, name) is not None}
     if a.resize:
-        options["resize"] = tuple(int(n) for n in _numbers(a.resize.lower(), "x", 2, "--resize", "WxH"))
-    return open_sequence(a.source, format=a.format, **{k: v for k, v in options.items() if v is not None})
-
-
-def _numbers(text: str, separator: str, count: int, option: str, form: str) -> tuple[float, ...]:
-    try:
-        values = tuple(float(part) for part in text.split(separator))
-    except ValueError:
-        values = ()
-    if len(values) != count:
-        raise SNHError(f"{option} must look like {form}, got '{text}'")
-    return values
+        width, by, height = a.resize.lower().partition("x")
+        if not (by and width.isdigit() and height.isdigit()):
+            raise SNHError(f"--resize must look like 640x480, got '{a.resize}'")
+        options["resize"] = (int(width), int(height))
+    return open_sequence(a.source, format=a.format, **options)
 
 
 def _config(a: argparse.Namespace):

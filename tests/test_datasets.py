@@ -437,6 +437,28 @@ def test_bad_calibration_files(tmp_path: Path, name: str, text: str, sentence: s
         open_sequence(folder)
 
 
+# --- built-in scene
+
+
+def test_builtin_takes_the_same_options() -> None:
+    sequence = open_sequence("builtin", start=200, frames=5, stride=3, resize=(64, 48), crop=2)
+    assert len(sequence) == 5
+    check(sequence)
+    assert sequence[4].timestamp == pytest.approx(212 / 30) and sequence[4].rgb.shape == (44, 60, 3)
+    assert open_sequence("builtin:2:kinect", frames=2).name == "builtin-2-kinect"
+
+
+@pytest.mark.parametrize("source", ["builtin:9", "builtin:nothing"])
+def test_builtin_that_does_not_exist(source: str) -> None:
+    with pytest.raises(DataError):
+        open_sequence(source)
+
+
+def test_builtin_has_its_own_camera() -> None:
+    with pytest.raises(ConfigError, match="its own camera"):
+        open_sequence("builtin", intrinsics=INTRINSICS)
+
+
 # --- bad input
 
 

@@ -6,9 +6,15 @@ import pkgutil
 
 import pytest
 
+import snh.nn
 import snh.ops
 
-MODULES = [f"snh.ops.{m.name}" for m in pkgutil.iter_modules(snh.ops.__path__) if not m.name.startswith("_")]
+MODULES = [
+    f"{package.__name__}.{module.name}"
+    for package in (snh.ops, snh.nn)
+    for module in pkgutil.iter_modules(package.__path__)
+    if not module.name.startswith("_")
+]
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -1,8 +1,9 @@
+#include "hash_table/hash_table.h"
+
 #include <algorithm>
 
 #include "common/key.h"
 #include "common/lattice.h"
-#include "hash_table/hash_table.h"
 
 namespace snh::cpu {
 

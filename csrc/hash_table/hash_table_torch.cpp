@@ -1,6 +1,7 @@
+#include "hash_table/hash_table.h"
+
 #include "common/check.h"
 #include "common/key.h"
-#include "hash_table/hash_table.h"
 
 namespace snh {
 

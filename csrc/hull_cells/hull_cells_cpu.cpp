@@ -1,3 +1,5 @@
+#include "hull_cells/hull_cells.h"
+
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -8,7 +10,6 @@
 #include "common/key.h"
 #include "common/lattice.h"
 #include "hull_cells/exact.h"
-#include "hull_cells/hull_cells.h"
 
 namespace snh::cpu {
 

@@ -1,10 +1,11 @@
+#include "hull_cells/hull_cells.h"
+
 #include <algorithm>
 #include <cmath>
 #include <tuple>
 
 #include "common/check.h"
 #include "common/lattice.h"
-#include "hull_cells/hull_cells.h"
 
 namespace snh {
 
