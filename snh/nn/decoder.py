@@ -27,11 +27,7 @@ class FrequencyEncoding(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Points [..., 3] m -> [..., 6 n_octaves]."""
         parts = [f(k * points) for k in self.wave_numbers for f in (torch.sin, torch.cos)]
-<<<<<<< HEAD
-        return torch.cat([*parts, points[..., :0]], dim=-1)
-=======
         return torch.cat(parts, dim=-1) if parts else points[..., :0]
->>>>>>> main
 
 
 class Decoder(nn.Module):

@@ -80,11 +80,7 @@ class PlaneHashEncoding(nn.Module):
         """Bytes held by features and table; or, `occupied`, of the F features of the vertices that exist alone."""
         if occupied:
             return self.n_vertices * self.n_features * self.features.element_size()
-<<<<<<< HEAD
-        return max(self._storage.nbytes, self.features.nbytes) + self.table.n_bytes
-=======
         return self._storage.nbytes + self.table.n_bytes
->>>>>>> main
 
     def allocate_hull(self, points: Tensor, origin: Tensor, hull_scale: float = 1.1) -> int:
         """Makes every vertex of the cells that the scaled hull of a frame touches. Returns how many bricks are new.
@@ -125,20 +121,6 @@ class PlaneHashEncoding(nn.Module):
         return n_new
 
     def _resize(self, n_rows: int) -> None:
-<<<<<<< HEAD
-        """Gives `features` n_rows rows, the new ones zero; storage doubles, so that growing is rarely a copy."""
-        old, grad = self.features.data, self.features.grad
-        if self._storage.data_ptr() != old.data_ptr():  # somebody, such as Module.to, put other data there
-            self._storage = old
-        if n_rows > len(self._storage):
-            self._storage = _with_rows(old, max(n_rows, 2 * len(self._storage)))
-        self.features.grad = None
-        # Autograd remembers the shape in a node that lives as long as any old loss; data of another type drops it.
-        other = torch.float64 if old.dtype == torch.float32 else torch.float32
-        self.features.data = torch.empty(0, dtype=other, device=old.device)
-        self.features.data = self._storage[:n_rows]
-        self.features.grad = None if grad is None else _with_rows(grad, n_rows)
-=======
         """Appends zero rows to `features` and its gradient; storage doubles, so that this is rarely a copy."""
         self._own_features()
         if n_rows > len(self._storage):
@@ -158,7 +140,6 @@ class PlaneHashEncoding(nn.Module):
         """Takes over data that somebody else, such as Module.to, gave to `features`."""
         if self._storage.data_ptr() != self.features.data_ptr():
             self._storage = self.features.data
->>>>>>> main
 
     def _initialise(self, new_masks: Tensor) -> None:
         """Random features for the vertices that new_masks [B] names."""
@@ -174,13 +155,6 @@ class PlaneHashEncoding(nn.Module):
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)
         self.table = self.table.to(self.features.device)
-<<<<<<< HEAD
-        self._storage = self.features.data
-        return self
-
-    def _save_to_state_dict(self, destination, prefix, keep_vars):
-        destination[prefix + "features"] = self.features if keep_vars else self.features.detach().clone()  # not the room
-=======
         self._own_features()
         return self
 
@@ -188,7 +162,6 @@ class PlaneHashEncoding(nn.Module):
         destination[prefix + "features"] = (
             self.features if keep_vars else self.features.detach().clone()
         )  # not the room
->>>>>>> main
         destination[prefix + "brick_keys"] = self.table.brick_keys.clone()
         destination[prefix + "masks"] = self.table.masks.clone()
 
@@ -200,14 +173,6 @@ class PlaneHashEncoding(nn.Module):
             return
         features, brick_keys, masks = (state_dict[name].to(self.features.device) for name in names)
         if features.shape != (BRICK_VERTICES * len(brick_keys), FEATURE_STRIDE) or masks.shape != brick_keys.shape:
-<<<<<<< HEAD
-            errors.append(f"{names[0]} {list(features.shape)} does not fit {len(brick_keys)} bricks of {BRICK_VERTICES}")
-            return
-        self.table = HashTable.from_bricks(brick_keys, masks)
-        self._resize(len(features))
-        with torch.no_grad():
-            self.features.copy_(features)
-=======
             errors.append(
                 f"{names[0]} {list(features.shape)} does not fit {len(brick_keys)} bricks of {BRICK_VERTICES}"
             )
@@ -215,7 +180,6 @@ class PlaneHashEncoding(nn.Module):
         self.table = HashTable.from_bricks(brick_keys, masks)
         self._storage = features.to(self.features.dtype, copy=True)
         self._set_features(self._storage)
->>>>>>> main
 
 
 def follow_growth(optimizer: AnyOptimizer) -> AnyOptimizer:
@@ -254,21 +218,6 @@ def _normal(keys: Tensor, n_features: int, seed: int) -> Tensor:
     logarithm takes part.
     """
     places = torch.arange(BRICK_VERTICES * n_features, device=keys.device) + 1
-<<<<<<< HEAD
-    bits = _mix(_mix(keys + seed * _GOLDEN)[:, None] + places * _GOLDEN)
-    total = sum(bits >> shift & 0xFFFF for shift in (0, 16, 32, 48))
-    normal = (total - 2 * 0xFFFF).double() / ((2**32 - 1) / 3) ** 0.5
-    return normal.view(len(keys), BRICK_VERTICES, n_features)
-
-
-_GOLDEN = 0x9E3779B97F4A7C15 - 2**64
-
-
-def _mix(x: Tensor) -> Tensor:
-    """Finaliser of splitmix64 on int64, which wraps around."""
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9 - 2**64), (27, 0x94D049BB133111EB - 2**64)):
-        x = (x ^ (x >> shift & 2 ** (64 - shift) - 1)) * factor
-=======
     bits = _mix(_mix(keys + _int64(seed * _GOLDEN))[:, None] + places * _int64(_GOLDEN))
     lanes = bits[..., None] >> torch.tensor([0, 16, 32, 48], device=keys.device) & 0xFFFF
     normal = (lanes.sum(-1) - 2 * 0xFFFF).double() / ((2**32 - 1) / 3) ** 0.5
@@ -287,5 +236,4 @@ def _mix(x: Tensor) -> Tensor:
     """Finaliser of splitmix64 on int64, which wraps around; its shifts are logical ones."""
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> shift & 2 ** (64 - shift) - 1)) * _int64(factor)
->>>>>>> main
     return x ^ (x >> 31 & 2**33 - 1)
