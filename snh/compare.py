@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from snh.datasets import Sequence, open_sequence
+from snh.datasets.poses import read_tum
+from snh.datasets.tum import associate
 from snh.errors import DataError
 from snh.eval.reconstruction import evaluate_reconstruction
-from snh.eval.trajectory import associate, ate, read_tum, rpe
+from snh.eval.trajectory import ate, rpe
 from snh.files import write_atomically
 from snh.mesh import load_mesh
+
+MAX_DIFFERENCE = 0.02  # s between a pose and its reference
 
 
 def compare(estimate: Path, reference: Path, source: str | None, protocol: str, json_path: Path | None) -> int:
@@ -39,9 +43,7 @@ def _trajectory_errors(estimate: Path, reference: Path) -> dict:
         times_ref, T_ref = _reference_of(open_sequence(reference))
     else:
         times_ref, T_ref = read_tum(reference)
-    i, j = associate(times, times_ref)
-    if len(i) == 0:
-        raise DataError(f"no pose of {estimate} is within 0.02 s of one of {reference}; do both use the same clock?")
+    i, j = _paired(times, times_ref)
     absolute, relative = ate(T_est[i], T_ref[j]), rpe(T_est[i], T_ref[j])
     return {
         "ate_rmse_cm": absolute.rmse_cm,
@@ -60,9 +62,18 @@ def _mesh_errors(run: Path, reference: Path, source: str | None, protocol: str) 
     sequence = open_sequence(source)
     times, T_est = read_tum(run / "trajectory.txt")
     times_ref, T_ref = _reference_of(sequence)
-    i, j = associate(times, times_ref)
+    i, j = _paired(times, times_ref)
     placed = load_mesh(run / "mesh.ply").transformed(ate(T_est[i], T_ref[j]).T_ref_est)
     return evaluate_reconstruction(placed, load_mesh(reference), sequence.camera, T_ref[j][::2], protocol)  # type: ignore[arg-type]
+
+
+def _paired(times: np.ndarray, times_ref: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the poses that belong together, by time."""
+    pairs = associate(times, times_ref, MAX_DIFFERENCE)
+    if not pairs:
+        raise DataError(f"no two poses are within {MAX_DIFFERENCE} s of each other; do both use the same clock?")
+    i, j = np.array(pairs).T
+    return i, j
 
 
 def _reference_of(sequence: Sequence) -> tuple[np.ndarray, np.ndarray]:

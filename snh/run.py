@@ -18,7 +18,8 @@ from tqdm import tqdm
 
 from snh import ops
 from snh.config import Config
-from snh.datasets import FrameError, Sequence, View, check, open_sequence, prefetch
+from snh.datasets import FrameError, Sequence, check, prefetch
+from snh.datasets.builtin import BuiltinSequence
 from snh.errors import OutputError
 from snh.eval.reconstruction import evaluate_reconstruction
 from snh.eval.trajectory import ate, write_tum
@@ -60,7 +61,7 @@ def run_demo(
     config: Config, out: Path, n_frames: int, seed: int, threads: int | None, with_mesh: bool, quiet: bool
 ) -> int:
     """SLAM in the built-in room, judged by its exact poses and surface."""
-    sequence = open_sequence("builtin", frames=n_frames)
+    sequence = BuiltinSequence(n_frames=n_frames)
     prepare_output(out)
     print(f"the built-in room: {len(sequence)} frames of {sequence.camera.width} x {sequence.camera.height} pixels")
     run = track_sequence(sequence, config, seed, threads, quiet)
@@ -73,9 +74,9 @@ def run_demo(
     return 130 if run.interrupted else 0
 
 
-def _against_truth(run: Run, sequence: View, mesh: Mesh) -> dict:
+def _against_truth(run: Run, sequence: BuiltinSequence, mesh: Mesh) -> dict:
     """Errors of a mesh of the built-in room, moved to the room by the trajectory's alignment."""
-    vertices, faces = sequence.source.ground_truth_mesh()
+    vertices, faces = sequence.ground_truth_mesh()
     truth = Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.zeros((len(vertices), 3), np.uint8))
     T_ref = sequence.reference()[run.indices]
     placed = mesh.transformed(ate(run.slam.trajectory(), T_ref).T_ref_est)
@@ -225,8 +226,7 @@ def draw_mesh(path: Path, mesh: Mesh, T_wc: np.ndarray) -> None:
 def measure(run: Run, T_wc: np.ndarray, T_ref: np.ndarray | None) -> dict:
     """The figures of a run; `ate_rmse_cm` is null without reference poses."""
     results, encoding = run.slam.results, run.slam.field.encoding
-    has_reference = T_ref is not None and np.isfinite(T_ref).all(axis=(1, 2)).any()
-    error = ate(T_wc, T_ref) if has_reference else None
+    error = None if T_ref is None or not np.isfinite(T_ref).all(axis=(1, 2)).any() else ate(T_wc, T_ref)
     statuses = [r.status for r in results]
     residuals = [r.residual_cm for r in results if r.status == "ok"]
     return {

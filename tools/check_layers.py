@@ -20,7 +20,7 @@ LAYERS = [
     {"ops"},
     {"nn", "datasets", "mesh"},
     {"slam", "eval", "viz"},
-    {"run"},  # a whole run with its files
+    {"run", "compare", "doctor"},  # one part per command of the command line
     {"cli"},
     {"", "__main__"},  # snh/__init__.py hands out the public names
 ]
@@ -33,7 +33,7 @@ CONFINED = {
     "open3d": {"mesh", "eval", "viz"},
     "trimesh": {"mesh", "eval", "viz"},
     "matplotlib": {"viz"},
-    "torch": {"ops", "nn", "slam", "mesh", "eval", "viz", "run"},
+    "torch": {"ops", "nn", "slam", "mesh", "eval", "viz", "run", "doctor"},
 }
 
 

@@ -101,7 +101,7 @@ class Tracker:
         losses = ops.field_map(
             *rays, torch.zeros(len(rays.depth), dtype=torch.int32), T, torch.from_numpy(uniforms),
             self.field.features.detach(), self.field.table, self.field.decoder.weight.detach(), self.field.spec,
-            sampling.n_base, sampling.n_surface, sampling.near, sampling.far, lambdas,
+            sampling.n_base, sampling.n_surface, sampling.near, sampling.far,
         )  # fmt: skip
         (losses * torch.tensor(lambdas)).sum().backward()
         assert T.grad is not None
@@ -121,7 +121,7 @@ class Tracker:
             part = Rays(*(t[subset] for t in rays))
             H, g = self._normal_equations(self._residuals(T_wc, part, uniforms[subset], reference))
             step = np.linalg.solve(H + np.diag(1e-4 * np.diag(H) + 1e-9), -g)
-            length = np.linalg.norm(step)
+            length = float(np.linalg.norm(step))
             T_wc = T_wc @ se3_exp(step * min(1.0, 0.1 / max(length, 1e-12)))
             if k >= 3 and length < 2e-5:  # 0.02 mm: far below the noise of any sensor
                 break
