@@ -8,15 +8,14 @@ import platform
 
 import torch
 
-import snh
-from snh import _core
+from snh import __version__, _core
 from snh.config import preset_folder, presets
 
 
 def doctor() -> int:
     """Prints one line for each thing that a problem report needs."""
     rows = [
-        ("snh-slam", snh.__version__),
+        ("snh-slam", __version__),
         ("python", platform.python_version()),
         ("torch", f"{torch.__version__}, {torch.get_num_threads()} of {os.cpu_count()} threads"),
         *((name, _version(name)) for name in ("numpy", "opencv-python-headless", "open3d", "trimesh")),
