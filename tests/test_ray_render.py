@@ -61,12 +61,11 @@ def test_epsilon_is_in_the_sum():
     assert abs(weight.item() - 0.5) < 1e-7 and abs(depth.item() - 0.5) < 1e-7
 
 
-def test_no_samples_and_no_weight_render_as_zero():
-    for n_samples in (0, 3):
-        color, depth, weight = ray_render(
-            torch.full((2, n_samples), 1e30), torch.ones(2, n_samples, 3), torch.ones(2, n_samples), 16.0
-        )
-        assert (color == 0).all() and (depth == 0).all() and (weight == 0).all() and weight.shape == (2, n_samples)
+@pytest.mark.parametrize("n_samples, tsdf", [(0, 0.0), (3, 1e30), (3, -1e30)])
+def test_no_samples_and_no_weight_render_as_zero(n_samples, tsdf):
+    samples = torch.full((2, n_samples), tsdf), torch.ones(2, n_samples, 3), torch.ones(2, n_samples)
+    color, depth, weight = ray_render(*samples, sharpness=16.0)
+    assert (color == 0).all() and (depth == 0).all() and (weight == 0).all() and weight.shape == (2, n_samples)
 
 
 # --- against the oracle -------------------------------------------------------------------------------------------
