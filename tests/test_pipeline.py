@@ -24,8 +24,8 @@ class Pipeline(torch.nn.Module):
         points = rays_o[:, None] + z[..., None] * rays_d[:, None]
         encoded, valid = plane_lookup(points.reshape(-1, 3), self.features, self.table, CELL_SIZES)
         decoded = self.decoder(encoded).reshape(*z.shape, 4)
-        color, depth, weight = ray_render(decoded[..., 0], decoded[..., 1:].sigmoid(), z, sharpness=10.0, cut_behind=0.1)
-        return color, depth, weight, valid
+        tsdf, color = decoded[..., 0], decoded[..., 1:].sigmoid()
+        return *ray_render(tsdf, color, z, sharpness=10.0, cut_behind=0.1), valid
 
 
 def rays(n_rays):
