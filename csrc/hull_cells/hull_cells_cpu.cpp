@@ -184,8 +184,7 @@ Point centroid(const Polygon& hull) {
   return mean;
 }
 
-// --- cells
-// --------------------------------------------------------------------------------------------------------
+// --- cells ---------------------------------------------------------------------------------------------
 
 constexpr int kFractionBits = 32;  // corners are integers, in units of 2^-32 cells
 constexpr int64_t kOneCell = int64_t{1} << kFractionBits;
@@ -238,8 +237,7 @@ Columns touched_cells(const std::vector<Corner>& corners) {
   return columns;
 }
 
-// Vertices of the cells: column i of vertices belongs to the columns i - 1 and i of cells, whose intervals
-// meet.
+// Vertices of the cells: column i of vertices belongs to the columns i - 1 and i of cells; their intervals meet.
 Columns corner_vertices(const Columns& cells) {
   const size_t count = cells.low.size();
   Columns vertices{cells.first, cells.low, cells.high};
