@@ -11,13 +11,13 @@
 // floor(), of some point of the closed scaled hull: cells own their lower sides and not their upper ones,
 // just as in a look-up. All four vertices of every touched cell are returned. Nothing is differentiable.
 //
-// Exactness. The corners of the unscaled hull are exact for any finite input (barring underflow of products,
-// below 1e-150 m). Scaled corners are rounded to T once, brought to cells by the product that a look-up uses,
-// and cut to multiples of 2^-32 cells; from there on every decision is integer arithmetic. With hull_scale =
-// 1 corners stay the given points, so each point that is a corner finds its own cell.
+// Exactness. The corners of the unscaled hull are exact while products of coordinates neither vanish nor
+// overflow (1e-150 to 1e150 m). Scaled corners are rounded to T once, brought to cells by the product that a
+// look-up uses, and cut to multiples of 2^-32 cells; from there on every decision is integer arithmetic. With
+// hull_scale = 1 corners stay the given points, so each point that is a corner finds its own cell.
 //
-// Throws std::runtime_error, one sentence, when a coordinate is not finite, or a hull reaches beyond what
-// keys can name or would need more than 2^24 bricks on one plane and level.
+// Throws std::runtime_error, one sentence, when a coordinate is not finite, a hull reaches beyond what keys can
+// name, or its bounding box would need more than 2^24 bricks on one plane and level.
 #pragma once
 
 #include <cstdint>

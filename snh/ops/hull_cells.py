@@ -22,7 +22,7 @@ def hull_cells(
     closed scaled hull, and all its four corners are created. float32 or float64; N may be 0; not differentiable.
 
     Raises RuntimeError when shapes or dtypes do not fit, a coordinate is not finite, the hull reaches beyond 2^29
-    cells from the world's origin, or would need more than 2^24 bricks on one plane.
+    cells from the world's origin, or its bounding box would need more than 2^24 bricks on one plane.
 
     >>> import torch
     >>> from snh.ops import HashTable
