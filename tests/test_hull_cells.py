@@ -97,6 +97,16 @@ def test_equals_oracle(n, scale):
     assert as_dict(*hull_cells(points, origin, CELLS, scale)) == reference.hull_bricks(hulls, CELLS)
 
 
+def test_ties_equal_oracle(dtype):
+    """Corners and sides on vertices and on sides of cells, where floor() and the open sides of cells decide."""
+    generator = torch.Generator().manual_seed(0)
+    for n in range(1, 61):
+        halves = torch.randint(-6, 7, (n % 6 + 1, 3), generator=generator)
+        points = (halves / 2).to(dtype)
+        hulls = reference.plane_hulls(points.tolist(), points[0].tolist(), 1)
+        assert as_dict(*hull_cells(points, points[0], [1.0], 1.0)) == reference.hull_bricks(hulls, [1.0]), halves
+
+
 @pytest.mark.parametrize("offset", [0.0, FAR, -FAR])
 @pytest.mark.parametrize("n", SIZES)
 def test_decisions_equal_oracle(dtype, n, offset):
