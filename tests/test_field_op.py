@@ -225,3 +225,171 @@ def test_opcheck():
     torch.library.opcheck(
         torch.ops.snh.field_query.default, (rays["dirs_c"], *scene_arguments, True, "reference"),
     )  # fmt: skip
+
+
+# --- the fast implementation against the plain one ------------------------------------------------------------------
+
+IMPLS = ["baseline", "avx2", "avx512"]
+# float32 against float64 on the same numbers, relative to the largest entry: rounding 6e-8, about 30 roundings deep
+# through two decoders, doubled per octave of gamma; sums over some 10^4 samples with signs. The pose gradient loses
+# another digit to cancellation between samples.
+BOUNDS = dict(losses=5e-6, features=1e-5, decoder=1e-5, T_wc=5e-5)
+
+
+@pytest.fixture(params=IMPLS)
+def impl(request) -> str:
+    try:
+        field_query(torch.zeros(0, 3), *empty_map(SPEC), impl=request.param)
+    except RuntimeError as error:
+        assert "does not have" in str(error)
+        pytest.skip(f"this processor does not have {request.param}")
+    return request.param
+
+
+def empty_map(spec):
+    return torch.zeros(0, 4), HashTable(), torch.zeros(spec.decoder_size), spec
+
+
+def rounded(scene, rays):
+    """The same with numbers that float32 holds exactly."""
+    scene = scene.to(torch.float32).to(torch.float64)
+    return scene, {k: v if k == "frame_index" else v.float().double() for k, v in rays.items()}
+
+
+def assert_fast_map(scene, rays, impl, bounds=BOUNDS, **samples):
+    scene, rays = rounded(scene, rays)
+    want = run_map(scene, rays, "reference", **samples)
+    got = run_map(scene.to(torch.float32), rays, impl, **samples)
+    for name, bound in bounds.items():
+        scale = want[name].abs().max().item() if want[name].numel() else 0.0
+        error = (got[name].double() - want[name]).abs().max().item() if want[name].numel() else 0.0
+        assert error <= bound * scale, f"{name}: error {error:.3g}, largest entry {scale:.3g}"
+    # A brick may be marked although its gradient is zero, never the other way round.
+    for gradient in (got["features"], want["features"]):
+        assert (got["touched"].bool() | (gradient.view(-1, 256) == 0).all(dim=1)).all()
+    absent = torch.ones(len(scene.features), dtype=torch.bool)
+    absent[list(scene.slots.values())] = False
+    assert not got["features"][absent].any()
+
+
+@pytest.mark.parametrize("n_rays", [0, 1, 31, 32, 33, 70])
+def test_fast_map(n_rays, impl):
+    assert_fast_map(make_scene(), make_rays(n_rays, N_BASE + N_SURFACE), impl)
+
+
+@pytest.mark.parametrize("samples", [(36, 12), (1, 0), (0, 1), (2, 3), (200, 17)], ids=str)
+def test_fast_map_sample_counts(samples, impl):
+    n_base, n_surface = samples
+    assert_fast_map(make_scene(), make_rays(11, sum(samples)), impl, n_base=n_base, n_surface=n_surface)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        dict(cut_behind=True),
+        dict(n_features=4, cell_sizes=(0.1,)),
+        dict(n_features=1, n_octaves=0),
+        dict(n_geometry=0, hidden=1),
+        dict(hidden=33, n_geometry=16, n_features=2),
+        dict(cell_sizes=tuple(0.05 * 1.2**k for k in range(16)), hidden=8, n_octaves=1),
+    ],
+    ids=str,
+)
+def test_fast_map_variants(change, impl):
+    scene = make_scene(replace(SPEC, **change))
+    scene.decoder *= 3 if "cut_behind" in change else 1  # so that rays do cross surfaces
+    assert_fast_map(scene, make_rays(40, N_BASE + N_SURFACE), impl)
+
+
+@pytest.mark.parametrize("centre", [-9.0, 40.0])
+def test_fast_map_away_from_the_origin(centre, impl):
+    """Coordinates of one sign: floor and truncation differ. Positions lose digits with the distance."""
+    box = tuple(tuple(x + centre for x in corner) for corner in ((-1.0, -1.2, 0.2), (1.1, 0.9, 1.9)))
+    rays = make_rays(33, N_BASE + N_SURFACE, centre=(centre,) * 3)
+    digits = dict(losses=1e-4, features=1e-3, decoder=1e-3, T_wc=1e-2)
+    assert_fast_map(make_scene(box=box), rays, impl, bounds=digits)
+
+
+@pytest.mark.parametrize("far", [1e5, -1e5, 1e12, float("nan")])
+def test_fast_map_far_outside(far, impl):
+    """100 km away there is no vertex: no gradient reaches the features, and nothing is read out of bounds."""
+    scene, rays = make_scene().to(torch.float32), make_rays(33, N_BASE + N_SURFACE)
+    rays["T_wc"][:, :3, 3] += far
+    got = run_map(scene, rays, impl)
+    assert not got["touched"].any() and not got["features"].any()
+    assert got["losses"].isfinite().all() or far != far
+    fine = run_map(scene, make_rays(33, N_BASE + N_SURFACE), impl)  # nothing of it is left in the workspace
+    assert all(value.isfinite().all() for value in fine.values())
+
+
+def test_fast_map_without_map(impl):
+    rays = {k: v if k == "frame_index" else v.float() for k, v in make_rays(33, 9).items()}
+    features, table, decoder, spec = empty_map(SPEC)
+    got = run_map(Scene(spec, table, {}, features, decoder + 0.1), rays, impl)
+    want = run_map(Scene(spec, table, {}, features.double(), decoder.double() + 0.1), rays, "reference")
+    assert_close(got["losses"], want["losses"], 1e-5, "losses")
+    assert_close(got["decoder"], want["decoder"], 1e-5, "decoder")
+
+
+@pytest.mark.parametrize("n_rays", [0, 1, 31, 32, 33, 250])
+@pytest.mark.parametrize("n_samples", [1, 3, 12])
+def test_fast_track(n_rays, n_samples, impl):
+    scene, rays = rounded(make_scene(), make_rays(n_rays, n_samples))
+
+    def run(impl, dtype):
+        dirs_c, depth, T_wc, uniforms = (rays[k].to(dtype) for k in ("dirs_c", "depth", "T_wc", "uniforms"))
+        features, decoder = scene.features.to(dtype), scene.decoder.to(dtype)
+        return field_track(
+            dirs_c, depth, T_wc[0], uniforms, features, scene.table, decoder, scene.spec, 0.08, impl=impl
+        )
+
+    got, want = run(impl, torch.float32), run("reference", torch.float64)
+    assert_close(got[0], want[0], 1e-5, "residuals")
+    assert_close(got[1], want[1], 1e-4, "jacobian")
+    assert got[2].equal(want[2])
+
+
+@pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 500])
+def test_fast_query(n, impl):
+    scene, _ = rounded(make_scene(), {})
+    points = torch.rand(n, 3, generator=torch.Generator().manual_seed(1)) * 4 - 2
+    want = field_query(points.double(), scene.features, scene.table, scene.decoder, scene.spec, impl="reference")
+    fast = scene.to(torch.float32)
+    got = field_query(points, fast.features, fast.table, fast.decoder, fast.spec, impl=impl)
+    assert_close(got[0], want[0], 1e-5, "tsdf")
+    assert_close(got[1], want[1], 1e-5, "color")
+    assert got[2].equal(want[2])
+
+
+def test_repeats_bit_for_bit_and_across_threads(impl):
+    scene, rays = make_scene().to(torch.float32), make_rays(70, N_BASE + N_SURFACE)
+    threads = torch.get_num_threads()
+    try:
+        runs = {}
+        for n in (1, 2, 3):
+            torch.set_num_threads(n)
+            runs[n] = run_map(scene, rays, impl)
+            again = run_map(scene, rays, impl)
+            assert all(runs[n][name].equal(again[name]) for name in again)
+    finally:
+        torch.set_num_threads(threads)
+    for n in (2, 3):
+        assert runs[n]["touched"].equal(runs[1]["touched"])
+        for name in BOUNDS:
+            assert_close(runs[n][name], runs[1][name].double(), 1e-6, f"{name} on {n} threads")
+
+
+def test_errors_name_the_argument():
+    scene, rays = make_scene(), make_rays(3, N_BASE + N_SURFACE)
+    with pytest.raises(RuntimeError, match=r"field_map_: 'baseline' needs float32"):
+        run_map(scene, rays, "baseline")
+    with pytest.raises(RuntimeError, match=r"field_map_: argument 'impl' must be .* got 'sse9'"):
+        run_map(scene, rays, "sse9")
+    with pytest.raises(RuntimeError, match=r"field_map_: argument 'frame_index' must be in 0 \.\. 2, got 7 for ray 1"):
+        run_map(scene, {**rays, "frame_index": torch.tensor([0, 7, 0], dtype=torch.int32)})
+    with pytest.raises(RuntimeError, match=r"field_map_: argument 'color' must have shape \[3, 3\], got \[2, 3\]"):
+        run_map(scene, {**rays, "color": rays["color"][:2]})
+    with pytest.raises(RuntimeError, match=r"field_query: argument 'decoder' must have shape"):
+        field_query(torch.zeros(1, 3).double(), scene.features, scene.table, scene.decoder[1:], scene.spec)
+    with pytest.raises(ValueError, match=r"a decoder of this FieldSpec has shape"):
+        SPEC.decoder_views(torch.zeros(3))

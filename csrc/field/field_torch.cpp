@@ -4,6 +4,7 @@
 
 #include "common/check.h"
 #include "common/key.h"
+#include "field/field_fast.h"
 
 namespace snh {
 namespace {
@@ -102,10 +103,25 @@ void check_frames(const char* op, const Tensor& frame_index, int64_t n_frames) {
                     " for ray ", r);
 }
 
-void check_impl(const char* op, const std::string& impl) {
-  STD_TORCH_CHECK(impl == "auto" || impl == "reference", "snh::", op,
-                  ": argument 'impl' must be 'auto' or 'reference', got '", impl, "'");
+// The implementation that a call asks for: "reference" or an instruction set. "auto" takes the best instruction set
+// for what the fast implementation covers: float32, at least one sample, tables of at most 2^24 bricks.
+std::string choose(const char* op, const std::string& impl, const Scene& scene, int64_t n_samples) {
+  const bool covered = scene.features.scalar_type() == ScalarType::Float && n_samples > 0 &&
+                       scene.brick_keys.size(0) <= fast::kMaxBricks;
+  if (impl == "auto") return covered ? fast::best_set() : "reference";
+  if (impl == "reference") return impl;
+  STD_TORCH_CHECK(impl == "baseline" || impl == "avx2" || impl == "avx512", "snh::", op,
+                  ": argument 'impl' must be 'auto', 'reference', 'baseline', 'avx2' or 'avx512', got '",
+                  impl, "'");
+  STD_TORCH_CHECK(fast::has_set(impl), "snh::", op, ": this processor or this build does not have '", impl,
+                  "'");
+  STD_TORCH_CHECK(
+      covered, "snh::", op, ": '", impl,
+      "' needs float32, at least one sample per ray and at most 2^24 bricks; use 'auto' or 'reference'");
+  return impl;
 }
+
+int n_threads() { return static_cast<int>(torch::stable::get_num_threads()); }
 
 // Output that the caller owns: it is written in place, so it must be contiguous already.
 void check_output(const char* op, const char* arg, const Tensor& t, ScalarType type,
@@ -120,11 +136,17 @@ struct MapTargets {
   const Tensor &features, &touched, &decoder, &T_wc;
 };
 
+template <typename T>
+FieldGradients<T> gradients_of(const MapTargets* targets) {
+  if (!targets) return {};
+  return {out<T>(targets->features), out<uint8_t>(targets->touched), out<T>(targets->decoder),
+          out<T>(targets->T_wc)};
+}
+
 Tensor run_map(const char* op, const Scene& scene, const Tensor& dirs_c, const Tensor& depth,
                const Tensor& color, const Tensor& frame_index, const Tensor& T_wc, const Tensor& uniforms,
                int64_t n_base, int64_t n_surface, double near, double far, const double lambdas[4],
                const MapTargets* targets, const std::string& impl) {
-  check_impl(op, impl);
   const ScalarType type = scene.features.scalar_type();
   const int64_t n_rays = depth.dim() == 1 ? depth.size(0) : -1;
   const Tensor color_c = checked(op, "color", color, type, {n_rays, 3});
@@ -146,15 +168,18 @@ Tensor run_map(const char* op, const Scene& scene, const Tensor& dirs_c, const T
   Tensor losses = torch::stable::new_empty(scene.features, {4});
   const FieldSampling sampling{static_cast<int>(n_base), static_cast<int>(n_surface), near, far};
 
+  const std::string chosen = choose(op, impl, scene, n_base + n_surface);
+  if (chosen != "reference") {
+    const float weights[4] = {float(lambdas[0]), float(lambdas[1]), float(lambdas[2]), float(lambdas[3])};
+    fast::field_map(chosen, scene.spec, scene.model<float>(), tensors.rays<float>(), sampling, weights,
+                    gradients_of<float>(targets), out<float>(losses), n_threads(), torch_parallel_for(1));
+    return losses;
+  }
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     const T weights[4] = {T(lambdas[0]), T(lambdas[1]), T(lambdas[2]), T(lambdas[3])};
-    FieldGradients<T> gradients{};
-    if (targets)
-      gradients = {out<T>(targets->features), out<uint8_t>(targets->touched), out<T>(targets->decoder),
-                   out<T>(targets->T_wc)};
-    cpu::field_map<T>(scene.spec, scene.model<T>(), tensors.rays<T>(), sampling, weights, gradients,
-                      out<T>(losses));
+    cpu::field_map<T>(scene.spec, scene.model<T>(), tensors.rays<T>(), sampling, weights,
+                      gradients_of<T>(targets), out<T>(losses));
   };
   type == ScalarType::Float ? call(0.0f) : call(0.0);
   return losses;
@@ -214,7 +239,6 @@ static std::tuple<Tensor, Tensor, Tensor> field_track(const Tensor& dirs_c, cons
                                                       const Tensor& T_wc, const Tensor& uniforms,
                                                       SNH_SCENE_PARAMETERS, double band, std::string impl) {
   constexpr const char* kOp = "field_track";
-  check_impl(kOp, impl);
   const Scene scene = SNH_SCENE(kOp);
   const ScalarType type = scene.features.scalar_type();
   const int64_t n_rays = depth.dim() == 1 ? depth.size(0) : -1;
@@ -228,6 +252,13 @@ static std::tuple<Tensor, Tensor, Tensor> field_track(const Tensor& dirs_c, cons
   Tensor residuals = torch::stable::new_empty(scene.features, {n_rays, n_samples});
   Tensor jacobian = torch::stable::new_empty(scene.features, {n_rays, n_samples, 6});
   Tensor valid = torch::stable::new_empty(scene.features, {n_rays, n_samples}, ScalarType::Bool);
+  const std::string chosen = choose(kOp, impl, scene, n_samples);
+  if (chosen != "reference") {
+    fast::field_track(chosen, scene.spec, scene.model<float>(), tensors.rays<float>(),
+                      static_cast<int>(n_samples), static_cast<float>(band), out<float>(residuals),
+                      out<float>(jacobian), out<bool>(valid), n_threads(), torch_parallel_for(1));
+    return {residuals, jacobian, valid};
+  }
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     cpu::field_track<T>(scene.spec, scene.model<T>(), tensors.rays<T>(), static_cast<int>(n_samples), T(band),
@@ -240,13 +271,19 @@ static std::tuple<Tensor, Tensor, Tensor> field_track(const Tensor& dirs_c, cons
 static std::tuple<Tensor, Tensor, Tensor> field_query(const Tensor& points, SNH_SCENE_PARAMETERS,
                                                       bool with_color, std::string impl) {
   constexpr const char* kOp = "field_query";
-  check_impl(kOp, impl);
   const Scene scene = SNH_SCENE(kOp);
   const Tensor x = checked(kOp, "points", points, scene.features.scalar_type(), {-1, 3});
   const int64_t n = x.size(0);
   Tensor tsdf = torch::stable::new_empty(x, {n});
   Tensor color = torch::stable::new_empty(x, {with_color ? n : 0, 3});
   Tensor valid = torch::stable::new_empty(x, {n}, ScalarType::Bool);
+  const std::string chosen = choose(kOp, impl, scene, 1);
+  if (chosen != "reference") {
+    fast::field_query(chosen, scene.spec, scene.model<float>(), in<float>(x), n, out<float>(tsdf),
+                      with_color ? out<float>(color) : nullptr, out<bool>(valid), n_threads(),
+                      torch_parallel_for(1));
+    return {tsdf, color, valid};
+  }
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     cpu::field_query<T>(scene.spec, scene.model<T>(), in<T>(x), n, out<T>(tsdf),

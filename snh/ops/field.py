@@ -108,8 +108,11 @@ def field_map_(
     weighted with `lambdas` (eq. 11).
 
     Samples as `ray_sample`, look-up as `plane_lookup` (eq. 4), decoders of eq. 5, rendering as `ray_render`
-    (eq. 6-7). `sparse_adam_` takes `grad_features` and `touched` and clears both. `impl` forces an implementation:
-    "reference" (float32 or float64), or "auto".
+    (eq. 6-7). `sparse_adam_` takes `grad_features` and `touched` and clears both.
+
+    `impl` forces an implementation: "reference" (plain, float32 or float64), or "baseline", "avx2", "avx512" (fast,
+    float32, on torch's threads; repeatable bit for bit at a given number of threads). "auto" takes the best instruction
+    set of this processor for float32, and the plain one for float64, rays without samples and more than 2^24 bricks.
 
     Raises RuntimeError when shapes, dtypes or frame indices do not fit.
     """
