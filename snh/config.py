@@ -123,7 +123,11 @@ class InputConfig:
 
 @dataclass(frozen=True)
 class MeshConfig:
-    voxel: float = _number(0.02, 1e-3)  # m
+    """The mesh at the end of a run."""
+
+    voxel: float = _number(0.02, 1e-3)  # m, edge of a marching-cubes cell
+    inside_views: bool = True  # only what lies in the view of a keyframe, seen or hidden; the map reaches further
+    min_faces: int = _number(100, 0)  # connected pieces with fewer triangles are dropped
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import yaml
 from tqdm import tqdm
 
 from snh import ops
-from snh.config import Config
+from snh.config import Config, MeshConfig
 from snh.datasets import FrameError, Sequence, check, prefetch
 from snh.datasets.builtin import BuiltinSequence
 from snh.errors import OutputError
@@ -28,6 +28,7 @@ from snh.mesh import Mesh, candidate_blocks, extract_mesh, save_mesh
 from snh.mesh.views import dollhouse_view, up_direction
 from snh.nn import SceneField
 from snh.slam import SLAM
+from snh.slam.keyframes import Views
 from snh.slam.map_file import load_map, save_map
 from snh.viz import path_picture, render_mesh, save_png
 
@@ -85,11 +86,10 @@ def _against_truth(run: Run, sequence: BuiltinSequence, mesh: Mesh) -> dict:
 
 def mesh_again(run: Path, voxel: float | None, out: Path | None) -> int:
     """Extracts the mesh of a finished run's map once more."""
-    field, config, _ = load_map(run / "map.npz")
-    if voxel is not None:
-        config = config.updated({"mesh": {"voxel": voxel}}, "--voxel")
+    saved = load_map(run / "map.npz")
+    config = saved.config if voxel is None else saved.config.updated({"mesh": {"voxel": voxel}}, "--voxel")
     path = out or run / "mesh.ply"
-    mesh = mesh_of(field, config.mesh.voxel)
+    mesh = mesh_of(saved.field, saved.views, config.mesh)
     save_mesh(mesh, path)
     print(f"  {len(mesh.vertices)} vertices, {len(mesh.faces)} faces in {path}")
     return 0
@@ -172,14 +172,14 @@ def save_run(run: Run, sequence: Sequence, config: Config, out: Path, with_mesh:
     write_tum(out / "trajectory.txt", np.array(run.timestamps), T_wc)
     write_atomically(out / "config.yaml", yaml.safe_dump(config.to_dict(), sort_keys=False).encode())
     write_atomically(out / "frames.csv", _frame_table(run).encode())
-    save_map(out / "map.npz", slam, config)
+    save_map(out / "map.npz", slam)
     metrics = measure(run, T_wc, T_ref)
     write_metrics(out, metrics)
     draw_path(out / "path.png", T_wc, T_ref)
 
     mesh = None
     if with_mesh:
-        mesh = mesh_of(slam.field, config.mesh.voxel)
+        mesh = mesh_of(slam.field, slam.keyframes.views(), config.mesh)
         save_mesh(mesh, out / "mesh.ply")
         save_mesh(mesh, out / "mesh.glb")
         draw_mesh(out / "mesh.png", mesh, T_wc)
@@ -192,8 +192,8 @@ def write_metrics(out: Path, metrics: dict) -> None:
     write_atomically(out / "metrics.json", (json.dumps(metrics, indent=2) + "\n").encode())
 
 
-def mesh_of(field: SceneField, voxel: float) -> Mesh:
-    """The coloured surface of a field, everywhere its planes reach."""
+def mesh_of(field: SceneField, views: Views, config: MeshConfig) -> Mesh:
+    """The coloured surface of a field."""
     spec, table = field.spec, field.table
 
     def query(points: np.ndarray, with_color: bool):
@@ -202,8 +202,9 @@ def mesh_of(field: SceneField, voxel: float) -> Mesh:
         )
         return tuple(tensor.numpy() for tensor in answer)
 
-    blocks = candidate_blocks(table.brick_keys.numpy(), spec.cell_sizes[0], voxel)
-    return extract_mesh(query, blocks, voxel, spec.truncation)
+    blocks = candidate_blocks(table.brick_keys.numpy(), spec.cell_sizes[0], config.voxel)
+    observed = views.contain if config.inside_views else None
+    return extract_mesh(query, blocks, config.voxel, spec.truncation, observed=observed, min_faces=config.min_faces)
 
 
 def draw_path(path: Path, T_wc: np.ndarray, T_ref: np.ndarray | None) -> None:

@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from snh.config import KeyframeConfig
 from snh.frame import Camera, Frame
 from snh.slam.rays import Rays, pick_pixels, rays_of
+
+
+@dataclass(frozen=True)
+class Views:
+    """The viewing frusta of keyframes."""
+
+    camera: Camera
+    T_wc: np.ndarray  # [M, 4, 4]
+    reach: np.ndarray  # [M] m, largest depth
+
+    def contain(self, points: np.ndarray) -> np.ndarray:
+        """Which points [N, 3] m lie inside a frustum, seen or hidden; each a tenth wider and deeper than was measured."""
+        inside = np.zeros(len(points), dtype=bool)
+        size = np.array([self.camera.width, self.camera.height])
+        margin = 0.1 * size.max()
+        for T_wc, reach in zip(self.T_wc, self.reach, strict=True):
+            asked = np.nonzero(~inside)[0]
+            points_c = (points[asked] - T_wc[:3, 3]) @ T_wc[:3, :3]
+            ahead = (points_c[:, 2] > 0.01) & (points_c[:, 2] < 1.1 * reach)
+            asked = asked[ahead]
+            pixel = self.camera.project(points_c[ahead])
+            inside[asked] = ((pixel > -margin) & (pixel < size + margin)).all(axis=1)
+        return inside
 
 
 class KeyframeLibrary:
@@ -75,6 +100,10 @@ class KeyframeLibrary:
             np.concatenate([self._rgb[k][c] for k, c in zip(keyframes, chosen, strict=True)]),
         )
         return rays, np.repeat(np.arange(len(keyframes), dtype=np.int32), share)
+
+    def views(self) -> Views:
+        """What the keyframes look at."""
+        return Views(self.camera, self.T_wc.copy(), np.array([depth.max() for depth in self._depth]))
 
     @property
     def nbytes(self) -> int:

@@ -15,6 +15,7 @@ from snh.mesh.raycast import RayScene
 _OCCLUSION_RADIUS = 0.4  # m, reach of the contact shadows
 _OCCLUSION_RAYS = 4  # per ray of the picture; their mean over a window of rays on the same surface is smooth
 _OCCLUSION_WINDOW = 3  # rays to each side
+_BAND = 96  # rows shaded at a time, which bounds the memory
 _OCCLUSION_DEPTH = 0.75  # how much of its light a fully closed corner loses
 
 
@@ -45,25 +46,27 @@ def render_mesh(
 
 
 def _shade(mesh: Mesh, camera: Camera, T_wc: np.ndarray, contact_shadows: bool, image: np.ndarray) -> None:
-    """Write the colour of every pixel that meets the mesh into `image` [H, W, 3] float32."""
-    scene = RayScene(mesh)
+    """Write the colour of every pixel that meets the mesh into `image` [H, W, 3] float32, a band of rows at a time."""
+    scene, normals = RayScene(mesh), mesh.vertex_normals()
     directions = (camera.rays() @ T_wc[:3, :3].T).astype(np.float32)
-    hits = scene.cast(T_wc[:3, 3], directions)
-    hit = hits.face >= 0
-    corners, weights = mesh.faces[hits.face[hit]], hits.weights[hit][..., None]
-    points = T_wc[:3, 3].astype(np.float32) + hits.t[hit, None] * directions[hit]
-    color = (mesh.colors[corners] * weights).sum(axis=1)
-    normal = (mesh.vertex_normals()[corners] * weights).sum(axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    view = -directions[hit] / np.linalg.norm(directions[hit], axis=-1, keepdims=True)
-    cosine = np.sum(normal * view, axis=-1, keepdims=True)
-    normal = np.where(cosine < 0, -normal, normal)
-    light = np.zeros(hit.shape, dtype=np.float32)
-    light[hit] = 1
+    light, depth = np.ones(image.shape[:2], dtype=np.float32), np.zeros(image.shape[:2], dtype=np.float32)
+    for first in range(0, camera.height, _BAND):
+        rows = slice(first, first + _BAND)
+        hits = scene.cast(T_wc[:3, 3], directions[rows])
+        hit = hits.face >= 0
+        corners, weights = mesh.faces[hits.face[hit]], hits.weights[hit][..., None]
+        view = directions[rows][hit]
+        points = T_wc[:3, 3].astype(np.float32) + hits.t[hit, None] * view
+        normal = (normals[corners] * weights).sum(axis=1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        cosine = -np.sum(normal * view, axis=-1, keepdims=True) / np.linalg.norm(view, axis=-1, keepdims=True)
+        image[rows][hit] = (mesh.colors[corners] * weights).sum(axis=1) * (0.72 + 0.28 * np.abs(cosine))
+        depth[rows][hit] = hits.t[hit]
+        if contact_shadows:
+            light[rows][hit] -= _OCCLUSION_DEPTH * _closedness(scene, points, np.where(cosine < 0, -normal, normal))
     if contact_shadows:
-        light[hit] -= _OCCLUSION_DEPTH * _closedness(scene, points, normal)
-        light = _smooth(light, np.where(hit, hits.t, 0))
-    image[hit] = color * (0.72 + 0.28 * np.abs(cosine)) * light[hit][:, None]
+        light = np.where(depth > 0, _smooth(light, depth), 1)
+    image *= light[..., None]
 
 
 def _closedness(scene: RayScene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
