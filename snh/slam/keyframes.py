@@ -20,7 +20,7 @@ class Views:
     reach: np.ndarray  # [M] m, largest depth
 
     def contain(self, points: np.ndarray) -> np.ndarray:
-        """Which points [N, 3] m lie inside a frustum, seen or hidden; each a tenth wider and deeper than was measured."""
+        """Which points [N, 3] m lie inside a frustum, seen or hidden, made a tenth wider and deeper."""
         inside = np.zeros(len(points), dtype=bool)
         size = np.array([self.camera.width, self.camera.height])
         margin = 0.1 * size.max()
