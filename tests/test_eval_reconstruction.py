@@ -17,7 +17,7 @@ from snh.eval import (
 )
 from snh.frame import Camera
 from snh.geometry import inverse, se3_exp
-from snh.mesh import Mesh, RayScene, look_at
+from snh.mesh import Mesh, look_at
 
 N = 20_000
 CAMERA = Camera(200, 200, 100.0, 100.0, 99.5, 99.5)  # 45 degrees to each side
@@ -98,7 +98,7 @@ def test_distances_agree_with_independent_code():
     assert error.completion_ratio_5cm_pct == pytest.approx(100 * np.mean(nearest_ref < 0.05))
     shape = trimesh.Trimesh(room.vertices, room.faces, process=False)
     _, exact, _ = trimesh.proximity.closest_point_naive(shape, points[:500])
-    assert np.allclose(RayScene(room).distance(points[:500]), exact, atol=1e-6)  # float32 at 2 m
+    assert np.allclose(room.scene.distance(points[:500]), exact, atol=1e-6)  # float32 at 2 m
 
 
 def test_points_are_drawn_by_area_and_repeatably():

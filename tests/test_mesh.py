@@ -83,25 +83,31 @@ def test_blocks_are_welded_without_seam(block):
 
 
 def test_skipping_free_space_loses_nothing():
-    """The slope of the field may be twice that of a true distance; the dense lattice is the oracle."""
+    """Balls that hold one lattice corner each, at every place of a coarse cell, in a field whose slope is twice that
+    of a true distance; the dense lattice is the oracle."""
+    voxel = 0.01
+    places = np.stack(np.meshgrid(*[[8, 55]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def steep(points):
-        return 2 * room_distance(points)
+        distance = np.linalg.norm(points - [0.31, 0.33, 0.29], axis=-1) - 0.15
+        for center in places * voxel:
+            distance = np.minimum(distance, np.linalg.norm(points - center, axis=-1) - 0.6 * voxel)
+        return 2 * distance
 
-    voxel, block = 0.01, 64
     sparse, dense = Room(distance=steep), Room(distance=steep)
-    skipping = extract(sparse, voxel, block)
-    not_skipping = extract(dense, voxel, block=63)  # an odd block cannot be halved
+    skipping = extract_mesh(sparse, np.zeros((1, 3), int), voxel, TRUNCATION, block=64)
+    not_skipping = extract_mesh(dense, np.zeros((1, 3), int), voxel, TRUNCATION, block=63)  # odd: cannot be halved
     assert sparse.n_points < 0.5 * dense.n_points
+    assert as_trimesh(skipping).body_count == 9
     assert same_surface(skipping, not_skipping)
 
 
-def test_cells_with_an_invalid_corner_give_no_surface():
-    limit = 0.415  # between the corners at 0.40 and 0.42
-    mesh = extract(Room(valid=lambda points: points[:, 0] < limit))
-    assert mesh.vertices[:, 0].max() <= 0.40 + 1e-6
-    whole = extract(Room())
-    assert same_surface(mesh, whole.select_faces((whole.vertices[whole.faces][..., 0] <= 0.40 + 1e-6).all(axis=1)))
+@pytest.mark.parametrize(("voxel", "last"), [(0.02, 0.40), (0.01, 0.41)])  # without and with a coarse pass
+def test_cells_with_an_invalid_corner_give_no_surface(voxel, last):
+    mesh = extract(Room(valid=lambda points: points[:, 0] < 0.415), voxel)
+    assert mesh.vertices[:, 0].max() == pytest.approx(last, abs=1e-6)
+    whole = extract(Room(), voxel)
+    assert same_surface(mesh, whole.select_faces((whole.vertices[whole.faces][..., 0] <= last + 1e-6).all(axis=1)))
 
 
 def test_not_finite_values_are_invalid():
@@ -175,6 +181,15 @@ def test_candidate_blocks_by_hand():
     assert [-2, 1, 2] in blocks.tolist() and all(abs(b[0] + 2) <= 1 for b in blocks.tolist())
 
 
+def test_candidate_blocks_need_all_three_planes():
+    """Without plane zx, (0, 0, 4) and (4, 0, 0) would be candidates too; bricks and blocks are of one size."""
+    places = {0: [(0, 0), (4, 0)], 1: [(0, 0), (0, 4)], 2: [(0, 0), (4, 4)]}
+    keys = np.array([pack_key(0, plane, i, j) for plane in places for i, j in places[plane]])
+    blocks = candidate_blocks(keys, 0.02, 0.01, block=16).tolist()
+    assert [0, 0, 0] in blocks and [4, 0, 4] in blocks
+    assert [0, 0, 4] not in blocks and [4, 0, 0] not in blocks
+
+
 def test_candidate_blocks_cover_all_points_of_the_bricks():
     random = np.random.default_rng(3)
     points = random.uniform([-3, -1, 10], [2, 1.5, 14], (500, 3))
@@ -211,14 +226,15 @@ def test_saving_refuses_in_one_sentence_and_leaves_nothing(tmp_path, monkeypatch
     save_mesh(dataclasses.replace(mesh, colors=mesh.colors * 0), tmp_path / "mesh.ply")
     before = (tmp_path / "mesh.ply").read_bytes()
 
-    def full_disk(descriptor):
+    def full_disk(*arguments):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OutputError, match="No space left"):
-        save_mesh(mesh, tmp_path / "mesh.ply")
-    assert [path.name for path in tmp_path.iterdir()] == ["mesh.ply"]
-    assert (tmp_path / "mesh.ply").read_bytes() == before
+    for step in ("fsync", "replace"):
+        with monkeypatch.context() as patch, pytest.raises(OutputError, match="No space left"):
+            patch.setattr(os, step, full_disk)
+            save_mesh(mesh, tmp_path / "mesh.ply")
+        assert [path.name for path in tmp_path.iterdir()] == ["mesh.ply"]
+        assert (tmp_path / "mesh.ply").read_bytes() == before
 
 
 def test_loading_refuses_in_one_sentence(tmp_path):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from snh.errors import DataError, OutputError
 from snh.files import write_atomically
+from snh.mesh.raycast import RayScene
 
 # glTF is y up and looks along -z; our cameras are y down and look along +z.
 _GLTF_AXES = np.array([1, -1, -1], dtype=np.float32)
@@ -46,6 +48,11 @@ class Mesh:
         """Area of all triangles, m^2."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum())
+
+    @cached_property
+    def scene(self) -> RayScene:
+        """The mesh made ready for ray casting, once."""
+        return RayScene(self.vertices, self.faces)
 
     def select_faces(self, keep: np.ndarray) -> Mesh:
         """The mesh of the faces where `keep` [F] bool is true, without the vertices that no face uses."""

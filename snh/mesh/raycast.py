@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from snh.mesh.mesh import Mesh
-
 
 @dataclass(frozen=True)
 class Hits:
@@ -20,16 +18,16 @@ class Hits:
 
 
 class RayScene:
-    """A mesh made ready for ray casting and distance queries."""
+    """Triangles (vertices [V, 3] m, faces [F, 3]) made ready for ray casting and distance queries."""
 
-    def __init__(self, mesh: Mesh):
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         import open3d as o3d
 
         self._tensor = o3d.core.Tensor.from_numpy
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            self._tensor(np.ascontiguousarray(mesh.vertices, dtype=np.float32)),
-            self._tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)),
+            self._tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+            self._tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
         )
 
     def cast(self, rays_o: np.ndarray, rays_d: np.ndarray) -> Hits:

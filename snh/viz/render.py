@@ -47,7 +47,7 @@ def render_mesh(
 
 def _shade(mesh: Mesh, camera: Camera, T_wc: np.ndarray, contact_shadows: bool, image: np.ndarray) -> None:
     """Write the colour of every pixel that meets the mesh into `image` [H, W, 3] float32, a band of rows at a time."""
-    scene, normals = RayScene(mesh), mesh.vertex_normals()
+    scene, normals = mesh.scene, mesh.vertex_normals()
     directions = (camera.rays() @ T_wc[:3, :3].T).astype(np.float32)
     light, depth = np.ones(image.shape[:2], dtype=np.float32), np.zeros(image.shape[:2], dtype=np.float32)
     for first in range(0, camera.height, _BAND):
