@@ -79,6 +79,13 @@ def test_by_hand(dtype, corners, cells):
     assert vertices_of(keys, masks, plane=0) == corners_of(*cells)
 
 
+def test_side_below_a_row_of_vertices_by_hand():
+    """Falls by 2^-32 cells, the finest step, over three cells: it leaves the row of its left end at once."""
+    points = torch.tensor([(0, 1, 0.5), (3, 1 - 2.0**-32, 0.5)], dtype=torch.float64)
+    keys, masks = hull_cells(points[1:], points[0], [1.0], hull_scale=1.0)
+    assert vertices_of(keys, masks, plane=0) == corners_of((0, 1), (0, 0), (1, 0), (2, 0), (3, 0))
+
+
 def test_planes_and_levels_by_hand():
     """One point, three cells; the same point on a level of twice the size."""
     point = torch.tensor([0.5, 3.5, -1.5])
