@@ -201,6 +201,18 @@ def test_every_point_is_covered(dtype, scale):
                 assert (table.find(vertices) >= 0).all()
 
 
+def test_points_on_borders_take_the_cell_of_a_look_up(dtype):
+    """k x 0.1 m rounds to either side of the border of cell k, and so does the product with 1 / 0.1."""
+    product = torch.tensor(1 / 0.1, dtype=dtype)
+    for k in range(-60, 61, 3):
+        point = torch.tensor([k * 0.1, (k + 1) * 0.1, (k + 2) * 0.1], dtype=dtype)
+        i, j, _ = (point * product).floor().long().tolist()
+        table = HashTable()
+        table.insert(*hull_cells(point[None], point, [0.1], hull_scale=1.0))
+        cell = torch.tensor([(0, 0, i + di, j + dj) for di in (0, 1) for dj in (0, 1)])
+        assert (table.find(cell) >= 0).all()
+
+
 def test_degenerate_hulls_scale_about_the_mean_corner():
     points = torch.tensor([[0.0, 0, 0], [2, 2, 2], [1, 1, 1], [1, 1, 1]])
     assert plane_hulls(points, points[0], 2.0)[0].tolist() == [[-1, -1], [3, 3]]
