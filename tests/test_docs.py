@@ -1,4 +1,4 @@
-"""Examples that readers copy, run as they stand: docstrings of the ops, code blocks of the guide."""
+"""Examples that readers copy, run as they stand: docstrings of ops and modules, code blocks of the guide."""
 
 import doctest
 import importlib
@@ -8,9 +8,15 @@ import re
 import pytest
 from conftest import ROOT
 
+import snh.nn
 import snh.ops
 
-MODULES = [f"snh.ops.{m.name}" for m in pkgutil.iter_modules(snh.ops.__path__) if not m.name.startswith("_")]
+MODULES = [
+    f"{package.__name__}.{module.name}"
+    for package in (snh.ops, snh.nn)
+    for module in pkgutil.iter_modules(package.__path__)
+    if not module.name.startswith("_")
+]
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -157,7 +157,7 @@ def test_hidden_surface_by_hand():
     noise = 100 * 0.5 / np.sqrt(N / 3)
     for mesh, expected in ((plate(1), 0), (joined(plate(1), plate(2, x=(-0.5, 0))), 55), (reference, 100)):
         hidden = hidden_surface(mesh, reference, CAMERA, eye, N)
-        assert hidden.share_hidden_pct == pytest.approx(50, abs=4 * noise)
+        assert hidden.share_pct == pytest.approx(50, abs=4 * noise)
         assert hidden.completion_ratio_5cm_pct == pytest.approx(expected, abs=4 * noise)
         assert np.isnan(hidden.near_completion_ratio_5cm_pct)  # 1 m behind what is seen
 
@@ -168,12 +168,12 @@ def test_hidden_surface_near_seen_surface():
     hidden = hidden_surface(joined(plate(1), plate(1.1)), reference, CAMERA, np.eye(4)[None], N)
     assert hidden.completion_ratio_5cm_pct == pytest.approx(50, abs=2)
     assert hidden.near_completion_ratio_5cm_pct == 100
-    assert hidden.share_hidden_pct == pytest.approx(200 / 3, abs=2)
+    assert hidden.share_pct == pytest.approx(200 / 3, abs=2)
 
 
 def test_nothing_hidden_is_said_so():
     hidden = hidden_surface(plate(1), plate(1), CAMERA, np.eye(4)[None], 1000)
-    assert hidden.share_hidden_pct == 0 and np.isnan(hidden.completion_ratio_5cm_pct)
+    assert hidden.share_pct == 0 and np.isnan(hidden.completion_ratio_5cm_pct)
 
 
 def wide(z: float) -> Mesh:

@@ -89,8 +89,10 @@ def test_from_bricks_is_the_same_table():
 
 
 def test_beyond_the_key_range_is_absent():
-    table = table_of([(0, 0, 0, 0)])
-    outside = [[-1, 0, 0, 0], [16, 0, 0, 0], [0, 3, 0, 0], [0, -1, 0, 0], [0, 0, 2**32, 0], [0, 0, 0, -(2**40)]]
+    """Also where the bits of a key would coincide: (0, 4) with (1, 0), and levels that exist nowhere."""
+    table = table_of([(0, 0, 0, 0), (1, 0, 0, 0), (20, 0, 0, 0)])
+    outside = [[-1, 0, 0, 0], [20, 0, 0, 0], [0, 3, 0, 0], [0, 4, 0, 0], [0, -1, 0, 0]]
+    outside += [[0, 0, 2**32, 0], [0, 0, 0, 2**32], [0, 0, 0, -(2**40)]]
     assert table.find(torch.tensor(outside)).tolist() == [-1] * len(outside)
 
 

@@ -79,6 +79,13 @@ def test_by_hand(dtype, corners, cells):
     assert vertices_of(keys, masks, plane=0) == corners_of(*cells)
 
 
+def test_side_below_a_row_of_vertices_by_hand():
+    """Falls by 2^-32 cells, the finest step, over three cells: it leaves the row of its left end at once."""
+    points = torch.tensor([(0, 1, 0.5), (3, 1 - 2.0**-32, 0.5)], dtype=torch.float64)
+    keys, masks = hull_cells(points[1:], points[0], [1.0], hull_scale=1.0)
+    assert vertices_of(keys, masks, plane=0) == corners_of((0, 1), (0, 0), (1, 0), (2, 0), (3, 0))
+
+
 def test_planes_and_levels_by_hand():
     """One point, three cells; the same point on a level of twice the size."""
     point = torch.tensor([0.5, 3.5, -1.5])
@@ -192,6 +199,18 @@ def test_every_point_is_covered(dtype, scale):
             for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
                 vertices = torch.cat([head, cells[:, [a, b]] + torch.tensor(corner)], dim=1)
                 assert (table.find(vertices) >= 0).all()
+
+
+def test_points_on_borders_take_the_cell_of_a_look_up(dtype):
+    """k x 0.1 m rounds to either side of the border of cell k, and so does the product with 1 / 0.1."""
+    product = torch.tensor(1 / 0.1, dtype=dtype)
+    for k in range(-60, 61, 3):
+        point = torch.tensor([k * 0.1, (k + 1) * 0.1, (k + 2) * 0.1], dtype=dtype)
+        i, j, _ = (point * product).floor().long().tolist()
+        table = HashTable()
+        table.insert(*hull_cells(point[None], point, [0.1], hull_scale=1.0))
+        cell = torch.tensor([(0, 0, i + di, j + dj) for di in (0, 1) for dj in (0, 1)])
+        assert (table.find(cell) >= 0).all()
 
 
 def test_degenerate_hulls_scale_about_the_mean_corner():
