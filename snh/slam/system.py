@@ -17,6 +17,7 @@ from snh.nn import SceneField
 from snh.slam.alignment import main_directions
 from snh.slam.keyframes import KeyframeLibrary
 from snh.slam.mapper import Mapper
+from snh.slam.pyramid import Pyramid
 from snh.slam.rays import clean_depth
 from snh.slam.tracker import Reference, Tracked, Tracker
 
@@ -79,7 +80,7 @@ class SLAM:
         status = self._usable(frame, depth)
         starts = self._predictions()
         if status == "no depth":
-            tracked = Tracked(starts[0], float("nan"), 0.0)
+            tracked = Tracked(starts[0], float("nan"), 0.0, Pyramid(frame.rgb, self.camera))
         else:
             tracked = self.tracker.track(frame, depth, starts, None if status == "no colour" else self._reference)
             if tracked.inlier_share < 0.2:
@@ -91,7 +92,7 @@ class SLAM:
         # Every few frames: make room in the map (eq. 1-3), then field and poses together (eq. 4-11).
         is_keyframe = status == "ok" and self._mapping_is_due(frame)
         if is_keyframe:
-            self._map(frame, depth, tracked.T_wc, self.config.mapping.iterations)
+            self._map(frame, depth, tracked, self.config.mapping.iterations)
         map_ms = 1000 * (time.perf_counter() - start) - track_ms
         return self._record(frame, status, tracked, is_keyframe, track_ms, map_ms)
 
@@ -105,9 +106,10 @@ class SLAM:
         if self.config.map.level_axes:
             T_wc[:3, :3] = main_directions(depth, self.camera)
         self._anchors.append((0, np.eye(4)))
-        self._map(frame, depth, T_wc, self.config.mapping.first_iterations)
+        tracked = Tracked(T_wc, 0.0, 1.0, Pyramid(frame.rgb, self.camera))
+        self._map(frame, depth, tracked, self.config.mapping.first_iterations)
         map_ms = 1000 * (time.perf_counter() - start)
-        return self._record(frame, "first", Tracked(T_wc, 0.0, 1.0), True, 0.0, map_ms)
+        return self._record(frame, "first", tracked, True, 0.0, map_ms)
 
     def _usable(self, frame: Frame, depth: np.ndarray) -> str:
         if np.count_nonzero(depth[::4, ::4]) < 16:
@@ -125,7 +127,8 @@ class SLAM:
     def _mapping_is_due(self, frame: Frame) -> bool:
         return frame.index - self.keyframes.frame_index[-1] >= self.config.mapping.every
 
-    def _map(self, frame: Frame, depth: np.ndarray, T_wc: np.ndarray, n_iterations: int) -> None:
+    def _map(self, frame: Frame, depth: np.ndarray, tracked: Tracked, n_iterations: int) -> None:
+        T_wc = tracked.T_wc
         points_c = self.camera.rays() * depth[..., None]
         points_w = points_c[depth > 0] @ T_wc[:3, :3].T.astype(np.float32) + T_wc[:3, 3].astype(np.float32)
         self.field.encoding.allocate_hull(
@@ -134,7 +137,7 @@ class SLAM:
         k = self.keyframes.add(frame, depth, T_wc, self.config.mapping.edge_depth)
         self._anchors[-1] = (k, np.eye(4))
         self.mapper.optimise(self.keyframes.window(), n_iterations)
-        self._reference = Reference(frame.rgb, self.keyframes.T_wc[k])
+        self._reference = Reference(tracked.colors, self.keyframes.T_wc[k])
 
     def _record(
         self, frame: Frame, status: str, tracked: Tracked, is_keyframe: bool, track_ms: float, map_ms: float

@@ -13,6 +13,7 @@ from snh.frame import Camera, Frame
 from snh.geometry import inverse, se3_exp
 from snh.nn import SceneField
 from snh.slam.mapper import twist_gradient
+from snh.slam.pyramid import Pyramid
 from snh.slam.rays import Rays, make_rays, pick_pixels
 
 
@@ -22,14 +23,15 @@ class Tracked:
 
     T_wc: np.ndarray  # [4, 4]
     residual_cm: float  # median distance of the frame's surface points to the map's surface
-    inlier_share: float  # of the surface points within the truncation of the map's surface
+    inlier_share: float  # of the surface points within half the band of the map's surface
+    colors: Pyramid  # the frame's, for when it becomes a keyframe
 
 
 @dataclass(frozen=True)
 class Reference:
     """The newest keyframe, whose colours eq. 13 compares with."""
 
-    rgb: np.ndarray  # [H, W, 3] uint8
+    colors: Pyramid
     T_wk: np.ndarray  # [4, 4]
 
 
@@ -59,16 +61,19 @@ class Tracker:
         """Pose of the frame; depth [H, W] m is its cleaned depth, `starts` the initial poses to choose from."""
         config = self.config
         find = {"adam": self._adam, "gauss_newton": self._gauss_newton}[config.tracker]
+        colors = Pyramid(frame.rgb, self.camera)
         rays, _ = self._draw(frame, depth, config.n_rays)
         T_wc = min(starts, key=lambda T: self._misfit(T, rays)) if len(starts) > 1 else starts[0]
-        T_wc = find(frame, depth, T_wc, reference)
+        T_wc = find(frame, depth, colors, T_wc, reference)
         distance = np.abs(self._surface(T_wc, rays, np.full((len(rays.depth), 1), 0.5, np.float32))[0][:, 0])
         inside = distance < 0.5 * config.band
-        return Tracked(T_wc, 100 * float(np.median(distance)), float(inside.mean()))
+        return Tracked(T_wc, 100 * float(np.median(distance)), float(inside.mean()), colors)
 
     # --- eq. 14 by Adam, as in the paper ------------------------------------------------------------------------
 
-    def _adam(self, frame: Frame, depth: np.ndarray, T_wc: np.ndarray, reference: Reference | None) -> np.ndarray:
+    def _adam(
+        self, frame: Frame, depth: np.ndarray, colors: Pyramid, T_wc: np.ndarray, reference: Reference | None
+    ) -> np.ndarray:
         config = self.config
         m, v = np.zeros(6), np.zeros(6)
         for k in range(1, config.iterations + 1):
@@ -76,7 +81,7 @@ class Tracker:
             if config.scheme == "standard":
                 gradient = self._rerendering_gradient(T_wc, rays)
             else:
-                gradient = self._gradient(self._residuals(T_wc, rays, uniforms, reference))
+                gradient = self._gradient(self._residuals(T_wc, rays, uniforms, rays.color, reference, 0))
             m = self.mapping.beta1 * m + (1 - self.mapping.beta1) * gradient
             v = self.mapping.beta2 * v + (1 - self.mapping.beta2) * gradient * gradient
             m_hat, v_hat = m / (1 - self.mapping.beta1**k), v / (1 - self.mapping.beta2**k)
@@ -110,20 +115,29 @@ class Tracker:
     # --- the same residuals by Gauss-Newton ---------------------------------------------------------------------
 
     def _gauss_newton(
-        self, frame: Frame, depth: np.ndarray, T_wc: np.ndarray, reference: Reference | None
+        self, frame: Frame, depth: np.ndarray, colors: Pyramid, T_wc: np.ndarray, reference: Reference | None
     ) -> np.ndarray:
-        """Damped, robust least squares on a growing subset of one draw of rays, until the step is negligible."""
+        """Damped, robust least squares on one draw of rays, until the step is negligible.
+
+        Coarse to fine: three iterations with a quarter of the rays and the colours at a quarter of the resolution,
+        two at half of it, the others on everything.
+        """
         config = self.config
         rays, uniforms = self._draw(frame, depth, config.n_rays)
-        n = len(rays.depth)
+        n, directions = len(rays.depth), rays.dirs_c.numpy()
         for k in range(config.iterations):
+            level = 2 if k < 3 else 1 if k < 5 else 0
+            if k in (0, 3, 5):
+                color = rays.color if level == 0 else torch.from_numpy(colors.sample(level, directions))
             subset = slice(0, n if k >= 3 else max(1, n // 4))
             part = Rays(*(t[subset] for t in rays))
-            H, g = self._normal_equations(self._residuals(T_wc, part, uniforms[subset], reference))
+            H, g = self._normal_equations(
+                self._residuals(T_wc, part, uniforms[subset], color[subset], reference, level)
+            )
             step = np.linalg.solve(H + np.diag(1e-4 * np.diag(H) + 1e-9), -g)
             length = float(np.linalg.norm(step))
             T_wc = T_wc @ se3_exp(step * min(1.0, 0.1 / max(length, 1e-12)))
-            if k >= 3 and length < 2e-5:  # 0.02 mm: far below the noise of any sensor
+            if level == 0 and length < 2e-5:  # 0.02 mm: far below the noise of any sensor
                 break
         return T_wc
 
@@ -158,18 +172,27 @@ class Tracker:
         )  # fmt: skip
         return residuals.numpy(), jacobian.numpy() * valid.numpy()[..., None]
 
-    def _residuals(self, T_wc: np.ndarray, rays: Rays, uniforms: np.ndarray, reference: Reference | None) -> Residuals:
+    def _residuals(
+        self,
+        T_wc: np.ndarray,
+        rays: Rays,
+        uniforms: np.ndarray,
+        color: torch.Tensor,
+        reference: Reference | None,
+        level: int,
+    ) -> Residuals:
+        """Both terms of eq. 14; `color` [R, 3] are the rays' colours at a level of the pyramids."""
         surface, surface_jacobian = self._surface(T_wc, rays, uniforms)
         if reference is None or self.config.scheme == "surface_only" or self.config.lambda_color == 0:
             return Residuals(surface, surface_jacobian, np.zeros((0, 3)), np.zeros((0, 3, 6)))
         T_kc = inverse(reference.T_wk) @ T_wc
-        camera = self.camera
-        color, jacobian, valid = ops.interframe(  # eq. 13
-            rays.dirs_c * rays.depth[:, None], rays.color, torch.from_numpy(T_kc.astype(np.float32)),
-            torch.from_numpy(reference.rgb), (camera.fx, camera.fy, camera.cx, camera.cy),
+        image, camera = reference.colors.levels[level]
+        difference, jacobian, valid = ops.interframe(  # eq. 13
+            rays.dirs_c * rays.depth[:, None], color, torch.from_numpy(T_kc.astype(np.float32)),
+            torch.from_numpy(image), (camera.fx, camera.fy, camera.cx, camera.cy),
         )  # fmt: skip
         seen = valid.numpy()
-        return Residuals(surface, surface_jacobian, color.numpy()[seen], jacobian.numpy()[seen])
+        return Residuals(surface, surface_jacobian, difference.numpy()[seen], jacobian.numpy()[seen])
 
     def _misfit(self, T_wc: np.ndarray, rays: Rays) -> float:
         """Mean surface distance of an initial pose, each clamped to the band."""
