@@ -16,7 +16,7 @@ CXX ?= c++
 ARGS ?=
 NATIVE_SOURCES := CMakeLists.txt setup.py $(wildcard csrc/*/*)
 FORMATTED := $(wildcard csrc/*/*.h csrc/*/*.cpp csrc/*/*.cu csrc/*/*.cuh tests/cpp/*.cpp)
-OP_TESTS := $(wildcard $(patsubst csrc/%,tests/test_%*.py,$(wildcard csrc/*)))
+OP_TESTS := $(wildcard $(patsubst csrc/%,tests/test_%*.py,$(wildcard csrc/*))) tests/test_cuda_kernels.py
 export PYTHON TORCH SNH_CUDA
 
 .DELETE_ON_ERROR:
@@ -59,7 +59,7 @@ build: $(VENV)/.requirements
 
 wheel: $(READY)
 	@rm -rf build/lib.*
-	@$(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
+	@SNH_CUDA_ARCHITECTURES=all $(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
 	@ls dist/*.whl
 
 clean:

@@ -2,9 +2,11 @@
 
 Environment:
   SNH_CUDA=auto|on|off            kernels where nvcc is found (default auto)
+  SNH_CUDA_ARCHITECTURES=all|90|...  devices that the kernels are built for (default: this machine's; where it has none,
+                                  75, which newer devices translate at the first start)
   SNH_SANITIZE=address,undefined  sanitizers, for the tests
   SNH_BUILD=FOLDER                where CMake builds (default build/native-<python>), kept for the next build
-  CMAKE_ARGS="-D... -D..."        passed on to CMake, for example -DEigen3_DIR=... or -DCMAKE_CUDA_ARCHITECTURES=90
+  CMAKE_ARGS="-D... -D..."        passed on to CMake, for example -DEigen3_DIR=...
 """
 
 import os
@@ -22,6 +24,8 @@ from setuptools.command.build_ext import build_ext
 ROOT = Path(__file__).resolve().parent
 OLDEST_TORCH = (2, 10)
 CUDA = os.environ.get("SNH_CUDA") or "auto"
+OWN_ARCHITECTURE = "native" if Path("/dev/nvidiactl").exists() else "75"
+ARCHITECTURES = os.environ.get("SNH_CUDA_ARCHITECTURES") or OWN_ARCHITECTURE
 
 
 def stop(reason: str) -> NoReturn:
@@ -73,11 +77,14 @@ class CMakeBuild(build_ext):
         check_requirements()
         cmake, ninja = tool("cmake"), tool("ninja")
         build = Path(os.environ.get("SNH_BUILD") or ROOT / "build" / f"native-{sys.implementation.cache_tag}")
+        shim = bool(self.inplace or os.environ.get("SNH_SANITIZE"))  # for tests, never for a wheel
         run([
             cmake, "-S", str(ROOT), "-B", str(build), "-G", "Ninja", "--log-level=NOTICE",
             f"-DCMAKE_MAKE_PROGRAM={ninja}",
             f"-DPython3_EXECUTABLE={sys.executable}",
             f"-DSNH_CUDA={CUDA}",
+            f"-DSNH_CUDA_ARCHITECTURES={ARCHITECTURES}",
+            f"-DSNH_SHIM={'ON' if shim else 'OFF'}",
             f"-DSNH_SANITIZE={os.environ.get('SNH_SANITIZE', '')}",
             *shlex.split(os.environ.get("CMAKE_ARGS", "")),
         ])  # fmt: skip
@@ -85,6 +92,8 @@ class CMakeBuild(build_ext):
         target = ROOT / "snh" if self.inplace else Path(self.build_lib) / "snh"
         target.mkdir(parents=True, exist_ok=True)
         for library in build.glob("_*.so"):
+            if library.name == "_shim.so" and not shim:
+                continue
             # A new file, not new contents: a process that has the old library loaded goes on undisturbed.
             (target / library.name).unlink(missing_ok=True)
             shutil.copy2(library, target)

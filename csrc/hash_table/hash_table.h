@@ -14,7 +14,16 @@
 
 #include <cstdint>
 
-namespace snh::cpu {
+#include "common/stream.h"
+
+namespace snh {
+
+struct KeyCheck {
+  int64_t first_wrong;  // first key that is negative or not above the one before it, n_keys if there is none
+  int64_t n_missing;    // keys that are not in the table, where all ascend
+};
+
+namespace cpu {
 
 // Fills probe [capacity] so that it finds bricks 0 .. n_bricks-1 again (rehash). Returns the number of bricks
 // placed: fewer than n_bricks means that brick_keys[returned] appears twice.
@@ -23,6 +32,10 @@ int64_t hash_table_build(const int64_t* brick_keys, int64_t n_bricks, int32_t* p
 // numbers [M] int32, output: brick number of each key [M], -1 = no such brick.
 void hash_table_numbers(const int64_t* keys, int64_t n_keys, const int32_t* probe, int64_t capacity,
                         const int64_t* brick_keys, int32_t* numbers);
+
+// What an insertion has to know of its keys first.
+KeyCheck hash_table_check(const int64_t* keys, int64_t n_keys, const int32_t* probe, int64_t capacity,
+                          const int64_t* brick_keys);
 
 // Adds the vertices new_masks [M] of the bricks keys [M] (strictly ascending). Unknown bricks get the numbers
 // n_bricks, n_bricks + 1, ... in ascending order of their keys, so the same sequence of calls gives the same
@@ -37,4 +50,29 @@ int64_t hash_table_insert(const int64_t* keys, const int64_t* new_masks, int64_t
 void hash_table_find(const int64_t* vertices, int64_t n_vertices, const int32_t* probe, int64_t capacity,
                      const int64_t* brick_keys, const int64_t* masks, int64_t* slots);
 
-}  // namespace snh::cpu
+}  // namespace cpu
+
+// On the device the probe array equals the CPU's bit for bit. A workspace is device memory, its content is lost.
+namespace cuda {
+
+// Waits for the stream.
+int64_t hash_table_build(const int64_t* brick_keys, int64_t n_bricks, int32_t* probe, int64_t capacity,
+                         int64_t workspace[1], Stream stream);
+
+void hash_table_numbers(const int64_t* keys, int64_t n_keys, const int32_t* probe, int64_t capacity,
+                        const int64_t* brick_keys, int32_t* numbers, Stream stream);
+
+// Waits for the stream.
+KeyCheck hash_table_check(const int64_t* keys, int64_t n_keys, const int32_t* probe, int64_t capacity,
+                          const int64_t* brick_keys, int64_t workspace[2], Stream stream);
+
+// Also gives the numbers [M] of all keys.
+void hash_table_insert(const int64_t* keys, const int64_t* new_masks, int64_t n_keys, int64_t n_bricks,
+                       int32_t* probe, int64_t capacity, int64_t* brick_keys, int64_t* masks,
+                       int32_t* numbers, int64_t workspace[1], Stream stream);
+
+void hash_table_find(const int64_t* vertices, int64_t n_vertices, const int32_t* probe, int64_t capacity,
+                     const int64_t* brick_keys, const int64_t* masks, int64_t* slots, Stream stream);
+
+}  // namespace cuda
+}  // namespace snh

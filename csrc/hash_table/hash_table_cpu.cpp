@@ -46,6 +46,16 @@ void hash_table_numbers(const int64_t* keys, int64_t n_keys, const int32_t* prob
   for (int64_t m = 0; m < n_keys; ++m) numbers[m] = number_of(keys[m], probe, capacity, brick_keys);
 }
 
+KeyCheck hash_table_check(const int64_t* keys, int64_t n_keys, const int32_t* probe, int64_t capacity,
+                          const int64_t* brick_keys) {
+  KeyCheck check{n_keys, 0};
+  for (int64_t m = 0; m < n_keys; ++m) {
+    if (keys[m] <= (m ? keys[m - 1] : -1)) return {m, 0};
+    check.n_missing += number_of(keys[m], probe, capacity, brick_keys) < 0;
+  }
+  return check;
+}
+
 int64_t hash_table_insert(const int64_t* keys, const int64_t* new_masks, int64_t n_keys, int64_t n_bricks,
                           int32_t* probe, int64_t capacity, int64_t* brick_keys, int64_t* masks) {
   int64_t next = n_bricks;

@@ -1,6 +1,7 @@
 #include "hash_table/hash_table.h"
 
 #include "common/check.h"
+#include "common/cuda_torch.h"
 #include "common/key.h"
 
 namespace snh {
@@ -24,13 +25,6 @@ void check_probe(const char* op, const Tensor& probe, int64_t n_bricks) {
   check_capacity(op, probe.size(0), n_bricks);
 }
 
-// Insertion numbers bricks in the order in which they come, so a wrong order would depend on the caller.
-void check_ascending(const char* op, const int64_t* keys, int64_t n_keys) {
-  for (int64_t m = 0; m < n_keys; ++m)
-    STD_TORCH_CHECK(keys[m] > (m ? keys[m - 1] : -1), "snh::", op,
-                    ": argument 'keys' must be non-negative and strictly ascending, entry ", m, " is not");
-}
-
 void check_in_place(const char* op, const char* arg, const Tensor& t) {
   STD_TORCH_CHECK(t.is_contiguous(), "snh::", op, ": argument '", arg,
                   "' is written in place and must be contiguous");
@@ -38,12 +32,19 @@ void check_in_place(const char* op, const char* arg, const Tensor& t) {
 
 Tensor hash_table_build(const Tensor& brick_keys, int64_t capacity) {
   constexpr const char* kOp = "hash_table_build";
+  const DeviceScope scope(kOp, {{"brick_keys", brick_keys}});
   check_keys(kOp, "brick_keys", brick_keys);
   check_capacity(kOp, capacity, brick_keys.size(0));
   const Tensor keys = torch::stable::contiguous(brick_keys);
   Tensor probe = torch::stable::new_empty(keys, {capacity}, ScalarType::Int);
-  const int64_t placed =
-      cpu::hash_table_build(in<int64_t>(keys), keys.size(0), out<int32_t>(probe), capacity);
+  int64_t placed = 0;
+  if (scope.on_cuda()) {
+    const Tensor workspace = torch::stable::new_empty(keys, {1});
+    SNH_KERNELS(placed = cuda::hash_table_build(in<int64_t>(keys), keys.size(0), out<int32_t>(probe),
+                                                capacity, out<int64_t>(workspace), scope.stream());)
+  } else {
+    placed = cpu::hash_table_build(in<int64_t>(keys), keys.size(0), out<int32_t>(probe), capacity);
+  }
   STD_TORCH_CHECK(placed == keys.size(0), "snh::", kOp,
                   ": argument 'brick_keys' must not repeat a key, entry ", placed, " does");
   return probe;
@@ -51,12 +52,18 @@ Tensor hash_table_build(const Tensor& brick_keys, int64_t capacity) {
 
 Tensor hash_table_numbers(const Tensor& probe, const Tensor& brick_keys, const Tensor& keys) {
   constexpr const char* kOp = "hash_table_numbers";
+  const DeviceScope scope(kOp, {{"probe", probe}, {"brick_keys", brick_keys}, {"keys", keys}});
   check_keys(kOp, "brick_keys", brick_keys);
   check_probe(kOp, probe, 0);
   check_keys(kOp, "keys", keys);
   const Tensor p = torch::stable::contiguous(probe), b = torch::stable::contiguous(brick_keys);
   const Tensor k = torch::stable::contiguous(keys);
   Tensor numbers = torch::stable::new_empty(k, {k.size(0)}, ScalarType::Int);
+  if (scope.on_cuda()) {
+    SNH_KERNELS(cuda::hash_table_numbers(in<int64_t>(k), k.size(0), in<int32_t>(p), p.size(0), in<int64_t>(b),
+                                         out<int32_t>(numbers), scope.stream());)
+    return numbers;
+  }
   cpu::hash_table_numbers(in<int64_t>(k), k.size(0), in<int32_t>(p), p.size(0), in<int64_t>(b),
                           out<int32_t>(numbers));
   return numbers;
@@ -66,6 +73,11 @@ Tensor hash_table_numbers(const Tensor& probe, const Tensor& brick_keys, const T
 void hash_table_insert_(Tensor probe, Tensor brick_keys, Tensor masks, int64_t n_bricks, const Tensor& keys,
                         const Tensor& new_masks) {
   constexpr const char* kOp = "hash_table_insert_";
+  const DeviceScope scope(kOp, {{"probe", probe},
+                                {"brick_keys", brick_keys},
+                                {"masks", masks},
+                                {"keys", keys},
+                                {"new_masks", new_masks}});
   check_keys(kOp, "keys", keys);
   check_dtype(kOp, "new_masks", new_masks, ScalarType::Long);
   check_shape(kOp, "new_masks", new_masks, {keys.size(0)});
@@ -76,21 +88,44 @@ void hash_table_insert_(Tensor probe, Tensor brick_keys, Tensor masks, int64_t n
   check_in_place(kOp, "brick_keys", brick_keys);
   check_in_place(kOp, "masks", masks);
   const Tensor k = torch::stable::contiguous(keys), m = torch::stable::contiguous(new_masks);
-  check_ascending(kOp, in<int64_t>(k), k.size(0));
+  check_probe(kOp, probe, 0);
+  const int64_t n_keys = k.size(0);
 
-  const Tensor numbers = hash_table_numbers(probe, brick_keys, k);
-  int64_t n_after = n_bricks;
-  for (int64_t i = 0; i < k.size(0); ++i) n_after += in<int32_t>(numbers)[i] < 0;
+  KeyCheck check{};
+  if (scope.on_cuda()) {
+    const Tensor workspace = torch::stable::new_empty(k, {2});
+    SNH_KERNELS(check =
+                    cuda::hash_table_check(in<int64_t>(k), n_keys, in<int32_t>(probe), probe.size(0),
+                                           in<int64_t>(brick_keys), out<int64_t>(workspace), scope.stream());)
+  } else {
+    check = cpu::hash_table_check(in<int64_t>(k), n_keys, in<int32_t>(probe), probe.size(0),
+                                  in<int64_t>(brick_keys));
+  }
+  // Insertion numbers bricks in the order in which they come, so a wrong order would depend on the caller.
+  STD_TORCH_CHECK(check.first_wrong == n_keys, "snh::", kOp,
+                  ": argument 'keys' must be non-negative and strictly ascending, entry ", check.first_wrong,
+                  " is not");
+  const int64_t n_after = n_bricks + check.n_missing;
   check_probe(kOp, probe, n_after);
   STD_TORCH_CHECK(n_bricks >= 0 && n_after <= brick_keys.size(0), "snh::", kOp, ": the storage holds ",
                   brick_keys.size(0), " bricks, but ", n_after, " are needed");
-  cpu::hash_table_insert(in<int64_t>(k), in<int64_t>(m), k.size(0), n_bricks, out<int32_t>(probe),
-                         probe.size(0), out<int64_t>(brick_keys), out<int64_t>(masks));
+  if (scope.on_cuda()) {
+    const Tensor numbers = torch::stable::new_empty(k, {n_keys}, ScalarType::Int);
+    const Tensor workspace = torch::stable::new_empty(k, {1});
+    SNH_KERNELS(cuda::hash_table_insert(in<int64_t>(k), in<int64_t>(m), n_keys, n_bricks, out<int32_t>(probe),
+                                        probe.size(0), out<int64_t>(brick_keys), out<int64_t>(masks),
+                                        out<int32_t>(numbers), out<int64_t>(workspace), scope.stream());)
+    return;
+  }
+  cpu::hash_table_insert(in<int64_t>(k), in<int64_t>(m), n_keys, n_bricks, out<int32_t>(probe), probe.size(0),
+                         out<int64_t>(brick_keys), out<int64_t>(masks));
 }
 
 Tensor hash_table_find(const Tensor& probe, const Tensor& brick_keys, const Tensor& masks,
                        const Tensor& vertices) {
   constexpr const char* kOp = "hash_table_find";
+  const DeviceScope scope(
+      kOp, {{"probe", probe}, {"brick_keys", brick_keys}, {"masks", masks}, {"vertices", vertices}});
   check_keys(kOp, "brick_keys", brick_keys);
   check_probe(kOp, probe, 0);
   check_dtype(kOp, "masks", masks, ScalarType::Long);
@@ -100,6 +135,11 @@ Tensor hash_table_find(const Tensor& probe, const Tensor& brick_keys, const Tens
   const Tensor p = torch::stable::contiguous(probe), b = torch::stable::contiguous(brick_keys);
   const Tensor m = torch::stable::contiguous(masks), v = torch::stable::contiguous(vertices);
   Tensor slots = torch::stable::new_empty(v, {v.size(0)});
+  if (scope.on_cuda()) {
+    SNH_KERNELS(cuda::hash_table_find(in<int64_t>(v), v.size(0), in<int32_t>(p), p.size(0), in<int64_t>(b),
+                                      in<int64_t>(m), out<int64_t>(slots), scope.stream());)
+    return slots;
+  }
   torch_parallel_for(16384)(v.size(0), [&](int64_t begin, int64_t end) {
     cpu::hash_table_find(in<int64_t>(v) + 4 * begin, end - begin, in<int32_t>(p), p.size(0), in<int64_t>(b),
                          in<int64_t>(m), out<int64_t>(slots) + begin);
@@ -111,7 +151,7 @@ Tensor hash_table_find(const Tensor& probe, const Tensor& brick_keys, const Tens
 
 }  // namespace snh
 
-STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
+SNH_OPS(m) {
   m.def("hash_table_build(Tensor brick_keys, int capacity) -> Tensor");
   m.def("hash_table_numbers(Tensor probe, Tensor brick_keys, Tensor keys) -> Tensor");
   m.def(
@@ -120,7 +160,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
       "Tensor new_masks) -> ()");
   m.def("hash_table_find(Tensor probe, Tensor brick_keys, Tensor masks, Tensor vertices) -> Tensor");
 }
-STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) {
+SNH_OPS_IMPL(m) {
   m.impl("hash_table_build", TORCH_BOX(&snh::hash_table_build));
   m.impl("hash_table_numbers", TORCH_BOX(&snh::hash_table_numbers));
   m.impl("hash_table_insert_", TORCH_BOX(&snh::hash_table_insert_));

@@ -18,6 +18,8 @@
 
 #include <cstdint>
 
+#include "common/stream.h"
+
 namespace snh {
 
 template <typename T>
@@ -32,4 +34,11 @@ void interframe(const T* points_c, const T* color, const T* T_kc, const uint8_t*
                 const Pinhole<T>& pinhole, int64_t n_rays, T* residuals, T* jacobian, bool* valid);
 
 }  // namespace cpu
+namespace cuda {
+
+void interframe(const float* points_c, const float* color, const float* T_kc, const uint8_t* image,
+                int height, int width, const Pinhole<float>& pinhole, int64_t n_rays, float* residuals,
+                float* jacobian, bool* valid, Stream stream);
+
+}  // namespace cuda
 }  // namespace snh

@@ -3,6 +3,7 @@
 #include <tuple>
 
 #include "common/check.h"
+#include "common/cuda_torch.h"
 
 namespace snh {
 
@@ -10,6 +11,7 @@ static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, con
                                                      const Tensor& T_kc, const Tensor& image, double fx,
                                                      double fy, double cx, double cy) {
   constexpr const char* kOp = "interframe";
+  const DeviceScope scope(kOp, {{"points_c", points_c}, {"color", color}, {"T_kc", T_kc}, {"image", image}});
   check_floating(kOp, "points_c", points_c);
   check_dtype(kOp, "color", color, points_c.scalar_type());
   check_dtype(kOp, "T_kc", T_kc, points_c.scalar_type());
@@ -24,6 +26,15 @@ static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, con
   Tensor residuals = torch::stable::new_empty(points, {n_rays, 3}),
          jacobian = torch::stable::new_empty(points, {n_rays, 3, 6}),
          valid = torch::stable::new_empty(points, {n_rays}, ScalarType::Bool);
+  if (scope.on_cuda()) {
+    const Pinhole<float> pinhole{static_cast<float>(fx), static_cast<float>(fy), static_cast<float>(cx),
+                                 static_cast<float>(cy)};
+    SNH_KERNELS(cuda::interframe(in<float>(points), in<float>(c), in<float>(pose), in<uint8_t>(pixels),
+                                 static_cast<int>(pixels.size(0)), static_cast<int>(pixels.size(1)), pinhole,
+                                 n_rays, out<float>(residuals), out<float>(jacobian), out<bool>(valid),
+                                 scope.stream());)
+    return {residuals, jacobian, valid};
+  }
 
   const auto call = [&](auto zero) {
     using T = decltype(zero);
@@ -38,9 +49,9 @@ static std::tuple<Tensor, Tensor, Tensor> interframe(const Tensor& points_c, con
 
 }  // namespace snh
 
-STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
+SNH_OPS(m) {
   m.def(
       "interframe(Tensor points_c, Tensor color, Tensor T_kc, Tensor image, float fx, float fy, float cx, "
       "float cy) -> (Tensor, Tensor, Tensor)");
 }
-STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) { m.impl("interframe", TORCH_BOX(&snh::interframe)); }
+SNH_OPS_IMPL(m) { m.impl("interframe", TORCH_BOX(&snh::interframe)); }

@@ -21,6 +21,7 @@
 
 #include "common/cell.h"
 #include "common/parallel.h"
+#include "common/stream.h"
 
 namespace snh {
 
@@ -38,8 +39,8 @@ struct PlaneLookup {  // what forward and backwards share
   int n_levels;
   Reduce reduce;
 
-  int level_width() const { return n_features * (reduce == Reduce::kCat ? 3 : 1); }
-  int64_t width() const { return static_cast<int64_t>(n_levels) * level_width(); }
+  SNH_HD int level_width() const { return n_features * (reduce == Reduce::kCat ? 3 : 1); }
+  SNH_HD int64_t width() const { return static_cast<int64_t>(n_levels) * level_width(); }
 };
 
 namespace cpu {
@@ -63,4 +64,18 @@ void plane_lookup_double_backward(const PlaneLookup<T>& in, const T* grad_encode
                                   T* grad_features);
 
 }  // namespace cpu
+
+// On the device gradients to features are sums in no fixed order. inv_cells is host memory.
+namespace cuda {
+
+void plane_lookup(const PlaneLookup<float>& in, float* encoded, bool* valid, Stream stream);
+
+void plane_lookup_backward(const PlaneLookup<float>& in, const float* grad_encoded, float* grad_points,
+                           float* grad_features, Stream stream);
+
+void plane_lookup_double_backward(const PlaneLookup<float>& in, const float* grad_encoded,
+                                  const float* v_points, const float* v_features, float* grad_grad_encoded,
+                                  float* grad_points, float* grad_features, Stream stream);
+
+}  // namespace cuda
 }  // namespace snh

@@ -5,6 +5,7 @@
 #include <tuple>
 
 #include "common/check.h"
+#include "common/cuda_torch.h"
 #include "common/lattice.h"
 
 namespace snh {
@@ -76,8 +77,6 @@ class Arguments {
   void call(const Body& body) const {
     points_.scalar_type() == ScalarType::Float ? call_typed<float>(body) : call_typed<double>(body);
   }
-
- private:
   template <typename T, typename Body>
   void call_typed(const Body& body) const {
     std::vector<T> inv_cells;
@@ -87,6 +86,7 @@ class Arguments {
                         inv_cells.data(), static_cast<int>(n_levels()), reduce_});
   }
 
+ private:
   Tensor points_, features_, probe_, brick_keys_, masks_;
   std::vector<double> cell_sizes_;
   int n_features_;
@@ -99,11 +99,23 @@ std::tuple<Tensor, Tensor> plane_lookup(const Tensor& points, const Tensor& feat
                                         const Tensor& brick_keys, const Tensor& masks,
                                         std::vector<double> cell_sizes, int64_t n_features,
                                         std::string reduce) {
-  const Arguments args("plane_lookup", points, features, probe, brick_keys, masks, std::move(cell_sizes),
-                       n_features, reduce);
+  constexpr const char* kOp = "plane_lookup";
+  const DeviceScope scope(kOp, {{"points", points},
+                                {"features", features},
+                                {"probe", probe},
+                                {"brick_keys", brick_keys},
+                                {"masks", masks}});
+  const Arguments args(kOp, points, features, probe, brick_keys, masks, std::move(cell_sizes), n_features,
+                       reduce);
   Tensor encoded = torch::stable::new_empty(args.points(), {args.n_points(), args.width()});
   Tensor valid =
       torch::stable::new_empty(args.points(), {args.n_points(), args.n_levels(), kPlanes}, ScalarType::Bool);
+  if (scope.on_cuda()) {
+    SNH_KERNELS(args.call_typed<float>([&](const PlaneLookup<float>& native) {
+      cuda::plane_lookup(native, out<float>(encoded), out<bool>(valid), scope.stream());
+    });)
+    return {encoded, valid};
+  }
   args.call([&](const auto& native) {
     using T = std::decay_t<decltype(*native.points)>;
     cpu::plane_lookup<T>(native, torch_parallel_for(kPointGrain), out<T>(encoded), out<bool>(valid));
@@ -117,6 +129,12 @@ std::tuple<Tensor, Tensor> plane_lookup_backward(const Tensor& grad_encoded, con
                                                  std::vector<double> cell_sizes, int64_t n_features,
                                                  std::string reduce, bool need_points, bool need_features) {
   constexpr const char* kOp = "plane_lookup_backward";
+  const DeviceScope scope(kOp, {{"grad_encoded", grad_encoded},
+                                {"points", points},
+                                {"features", features},
+                                {"probe", probe},
+                                {"brick_keys", brick_keys},
+                                {"masks", masks}});
   const Arguments args(kOp, points, features, probe, brick_keys, masks, std::move(cell_sizes), n_features,
                        reduce);
   check_dtype(kOp, "grad_encoded", grad_encoded, points.scalar_type());
@@ -124,6 +142,13 @@ std::tuple<Tensor, Tensor> plane_lookup_backward(const Tensor& grad_encoded, con
   const Tensor grad = torch::stable::contiguous(grad_encoded);
   Tensor grad_points = args.zeros_like_points(need_points),
          grad_features = args.zeros_like_features(need_features);
+  if (scope.on_cuda()) {
+    SNH_KERNELS(args.call_typed<float>([&](const PlaneLookup<float>& native) {
+      cuda::plane_lookup_backward(native, in<float>(grad), need_points ? out<float>(grad_points) : nullptr,
+                                  need_features ? out<float>(grad_features) : nullptr, scope.stream());
+    });)
+    return {grad_points, grad_features};
+  }
   args.call([&](const auto& native) {
     using T = std::decay_t<decltype(*native.points)>;
     cpu::plane_lookup_backward<T>(native, in<T>(grad), torch_parallel_for(kPointGrain), torch_parallel_for(1),
@@ -139,6 +164,14 @@ std::tuple<Tensor, Tensor, Tensor> plane_lookup_double_backward(
     const Tensor& masks, std::vector<double> cell_sizes, int64_t n_features, std::string reduce,
     bool need_features) {
   constexpr const char* kOp = "plane_lookup_double_backward";
+  const DeviceScope scope(kOp, {{"grad_encoded", grad_encoded},
+                                {"v_points", v_points},
+                                {"v_features", v_features},
+                                {"points", points},
+                                {"features", features},
+                                {"probe", probe},
+                                {"brick_keys", brick_keys},
+                                {"masks", masks}});
   const Arguments args(kOp, points, features, probe, brick_keys, masks, std::move(cell_sizes), n_features,
                        reduce);
   const auto checked = [&](const char* arg, const OptionalTensor& t, int64_t rows,
@@ -154,6 +187,15 @@ std::tuple<Tensor, Tensor, Tensor> plane_lookup_double_backward(
 
   Tensor grad_grad_encoded = torch::stable::new_empty(*grad, {args.n_points(), args.width()});
   Tensor grad_points = args.zeros_like_points(true), grad_features = args.zeros_like_features(need_features);
+  if (scope.on_cuda()) {
+    SNH_KERNELS(args.call_typed<float>([&](const PlaneLookup<float>& native) {
+      cuda::plane_lookup_double_backward(native, in<float>(*grad), v_p ? in<float>(*v_p) : nullptr,
+                                         v_f ? in<float>(*v_f) : nullptr, out<float>(grad_grad_encoded),
+                                         out<float>(grad_points),
+                                         need_features ? out<float>(grad_features) : nullptr, scope.stream());
+    });)
+    return {grad_grad_encoded, grad_points, grad_features};
+  }
   args.call([&](const auto& native) {
     using T = std::decay_t<decltype(*native.points)>;
     cpu::plane_lookup_double_backward<T>(
@@ -167,7 +209,7 @@ std::tuple<Tensor, Tensor, Tensor> plane_lookup_double_backward(
 }  // namespace
 }  // namespace snh
 
-STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
+SNH_OPS(m) {
   m.def(
       "plane_lookup(Tensor points, Tensor features, Tensor probe, Tensor brick_keys, Tensor masks, "
       "float[] cell_sizes, int n_features, str reduce) -> (Tensor, Tensor)");
@@ -180,7 +222,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
       "points, Tensor features, Tensor probe, Tensor brick_keys, Tensor masks, float[] cell_sizes, int "
       "n_features, str reduce, bool need_features) -> (Tensor, Tensor, Tensor)");
 }
-STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) {
+SNH_OPS_IMPL(m) {
   m.impl("plane_lookup", TORCH_BOX(&snh::plane_lookup));
   m.impl("plane_lookup_backward", TORCH_BOX(&snh::plane_lookup_backward));
   m.impl("plane_lookup_double_backward", TORCH_BOX(&snh::plane_lookup_double_backward));

@@ -30,6 +30,7 @@
 
 #include "common/hd.h"
 #include "common/parallel.h"
+#include "common/stream.h"
 
 namespace snh {
 
@@ -66,4 +67,16 @@ void ray_render_backward(const T* grad_color_ray, const T* grad_depth_ray, const
                          T* grad_color, T* grad_z);
 
 }  // namespace cpu
+namespace cuda {
+
+void ray_render(const float* tsdf, const float* color, const float* z, int64_t n_rays, int n_samples,
+                float sharpness, float cut_behind, float* color_ray, float* depth_ray, float* weight,
+                Stream stream);
+
+void ray_render_backward(const float* grad_color_ray, const float* grad_depth_ray, const float* grad_weight,
+                         const float* tsdf, const float* color, const float* z, const float* weight,
+                         int64_t n_rays, int n_samples, float sharpness, float* grad_tsdf, float* grad_color,
+                         float* grad_z, Stream stream);
+
+}  // namespace cuda
 }  // namespace snh

@@ -5,6 +5,7 @@
 #include <tuple>
 
 #include "common/check.h"
+#include "common/cuda_torch.h"
 
 namespace snh {
 namespace {
@@ -22,6 +23,7 @@ void check_samples(const char* op, const Tensor& tsdf, const Tensor& color, cons
 
 std::tuple<Tensor, Tensor, Tensor> ray_render(const Tensor& tsdf, const Tensor& color, const Tensor& z,
                                               double sharpness, std::optional<double> cut_behind) {
+  const DeviceScope scope("ray_render", {{"tsdf", tsdf}, {"color", color}, {"z", z}});
   check_samples("ray_render", tsdf, color, z);
   const Tensor s = torch::stable::contiguous(tsdf), c = torch::stable::contiguous(color),
                depths = torch::stable::contiguous(z);
@@ -30,6 +32,13 @@ std::tuple<Tensor, Tensor, Tensor> ray_render(const Tensor& tsdf, const Tensor& 
          depth_ray = torch::stable::new_empty(s, {n_rays}),
          weight = torch::stable::new_empty(s, {n_rays, n_samples});
   const double cut = cut_behind.value_or(std::numeric_limits<double>::infinity());
+  if (scope.on_cuda()) {
+    SNH_KERNELS(cuda::ray_render(in<float>(s), in<float>(c), in<float>(depths), n_rays,
+                                 static_cast<int>(n_samples), static_cast<float>(sharpness),
+                                 static_cast<float>(cut), out<float>(color_ray), out<float>(depth_ray),
+                                 out<float>(weight), scope.stream());)
+    return {color_ray, depth_ray, weight};
+  }
 
   const auto call = [&](auto zero) {
     using T = decltype(zero);
@@ -47,6 +56,13 @@ std::tuple<Tensor, Tensor, Tensor> ray_render_backward(const Tensor& grad_color_
                                                        const Tensor& color, const Tensor& z,
                                                        const Tensor& weight, double sharpness) {
   constexpr const char* kOp = "ray_render_backward";
+  const DeviceScope scope(kOp, {{"tsdf", tsdf},
+                                {"grad_color_ray", grad_color_ray},
+                                {"grad_depth_ray", grad_depth_ray},
+                                {"grad_weight", grad_weight},
+                                {"color", color},
+                                {"z", z},
+                                {"weight", weight}});
   check_samples(kOp, tsdf, color, z);
   const int64_t n_rays = tsdf.size(0), n_samples = tsdf.size(1);
   const auto checked = [&](const char* arg, const Tensor& t, const std::vector<int64_t>& shape) {
@@ -64,6 +80,14 @@ std::tuple<Tensor, Tensor, Tensor> ray_render_backward(const Tensor& grad_color_
          grad_color = torch::stable::new_empty(s, {n_rays, n_samples, 3}),
          grad_z = torch::stable::new_empty(s, {n_rays, n_samples});
 
+  if (scope.on_cuda()) {
+    SNH_KERNELS(cuda::ray_render_backward(in<float>(dc), in<float>(dz), in<float>(dp), in<float>(s),
+                                          in<float>(c), in<float>(depths), in<float>(p), n_rays,
+                                          static_cast<int>(n_samples), static_cast<float>(sharpness),
+                                          out<float>(grad_tsdf), out<float>(grad_color), out<float>(grad_z),
+                                          scope.stream());)
+    return {grad_tsdf, grad_color, grad_z};
+  }
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     cpu::ray_render_backward<T>(in<T>(dc), in<T>(dz), in<T>(dp), in<T>(s), in<T>(c), in<T>(depths), in<T>(p),
@@ -78,7 +102,7 @@ std::tuple<Tensor, Tensor, Tensor> ray_render_backward(const Tensor& grad_color_
 }  // namespace
 }  // namespace snh
 
-STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
+SNH_OPS(m) {
   m.def(
       "ray_render(Tensor tsdf, Tensor color, Tensor z, float sharpness, float? cut_behind) -> (Tensor, "
       "Tensor, Tensor)");
@@ -86,7 +110,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
       "ray_render_backward(Tensor grad_color_ray, Tensor grad_depth_ray, Tensor grad_weight, Tensor tsdf, "
       "Tensor color, Tensor z, Tensor weight, float sharpness) -> (Tensor, Tensor, Tensor)");
 }
-STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) {
+SNH_OPS_IMPL(m) {
   m.impl("ray_render", TORCH_BOX(&snh::ray_render));
   m.impl("ray_render_backward", TORCH_BOX(&snh::ray_render_backward));
 }

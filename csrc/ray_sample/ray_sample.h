@@ -13,10 +13,20 @@
 
 #include <cstdint>
 
-namespace snh::cpu {
+#include "common/stream.h"
+
+namespace snh {
+namespace cpu {
 
 template <typename T>
 void ray_sample(const T* depth, const T* uniforms, int64_t n_rays, int n_base, int n_surface, T near, T far,
                 T truncation, T* z);
 
-}  // namespace snh::cpu
+}  // namespace cpu
+namespace cuda {
+
+void ray_sample(const float* depth, const float* uniforms, int64_t n_rays, int n_base, int n_surface,
+                float near, float far, float truncation, float* z, Stream stream);
+
+}  // namespace cuda
+}  // namespace snh

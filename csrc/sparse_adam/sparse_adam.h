@@ -19,6 +19,7 @@
 #include <cstdint>
 
 #include "common/parallel.h"
+#include "common/stream.h"
 
 namespace snh {
 
@@ -38,4 +39,14 @@ template <typename T>
 void adam(T* parameters, const T* gradients, T* m, T* v, int64_t n, const AdamStep& adam);
 
 }  // namespace cpu
+namespace cuda {
+
+void sparse_adam(float* features, float* grad_features, float* m, float* v, int32_t* last_step,
+                 uint8_t* touched, const int64_t* masks, int64_t n_bricks, const AdamStep& adam,
+                 Stream stream);
+
+void adam(float* parameters, const float* gradients, float* m, float* v, int64_t n, const AdamStep& adam,
+          Stream stream);
+
+}  // namespace cuda
 }  // namespace snh

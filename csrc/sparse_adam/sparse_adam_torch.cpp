@@ -1,6 +1,7 @@
 #include "sparse_adam/sparse_adam.h"
 
 #include "common/check.h"
+#include "common/cuda_torch.h"
 #include "common/key.h"
 
 namespace snh {
@@ -26,6 +27,13 @@ static void sparse_adam_(Tensor features, Tensor grad_features, Tensor m, Tensor
                          double beta2, double eps) {
   constexpr const char* kOp = "sparse_adam_";
   const int64_t n_bricks = masks.dim() == 1 ? masks.size(0) : -1;
+  const DeviceScope scope(kOp, {{"features", features},
+                                {"grad_features", grad_features},
+                                {"m", m},
+                                {"v", v},
+                                {"last_step", last_step},
+                                {"touched", touched},
+                                {"masks", masks}});
   check_floating(kOp, "features", features);
   const ScalarType type = features.scalar_type();
   for (const auto& [arg, t] : {std::pair<const char*, const Tensor&>{"features", features},
@@ -38,6 +46,12 @@ static void sparse_adam_(Tensor features, Tensor grad_features, Tensor m, Tensor
   check_inplace(kOp, "masks", masks, ScalarType::Long, {-1});
   check_step(kOp, step);
   const AdamStep adam{step, lr, beta1, beta2, eps};
+  if (scope.on_cuda()) {
+    SNH_KERNELS(cuda::sparse_adam(out<float>(features), out<float>(grad_features), out<float>(m),
+                                  out<float>(v), out<int32_t>(last_step), out<uint8_t>(touched),
+                                  in<int64_t>(masks), n_bricks, adam, scope.stream());)
+    return;
+  }
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     cpu::sparse_adam<T>(out<T>(features), out<T>(grad_features), out<T>(m), out<T>(v),
@@ -50,6 +64,7 @@ static void sparse_adam_(Tensor features, Tensor grad_features, Tensor m, Tensor
 static void adam_(Tensor parameters, const Tensor& gradients, Tensor m, Tensor v, int64_t step, double lr,
                   double beta1, double beta2, double eps) {
   constexpr const char* kOp = "adam_";
+  const DeviceScope scope(kOp, {{"parameters", parameters}, {"gradients", gradients}, {"m", m}, {"v", v}});
   check_floating(kOp, "parameters", parameters);
   const ScalarType type = parameters.scalar_type();
   const int64_t n = parameters.dim() == 1 ? parameters.size(0) : -1;
@@ -60,6 +75,11 @@ static void adam_(Tensor parameters, const Tensor& gradients, Tensor m, Tensor v
     check_inplace(kOp, arg, t, type, {n});
   check_step(kOp, step);
   const AdamStep rule{step, lr, beta1, beta2, eps};
+  if (scope.on_cuda()) {
+    SNH_KERNELS(cuda::adam(out<float>(parameters), in<float>(gradients), out<float>(m), out<float>(v), n,
+                           rule, scope.stream());)
+    return;
+  }
   const auto call = [&](auto zero) {
     using T = decltype(zero);
     cpu::adam<T>(out<T>(parameters), in<T>(gradients), out<T>(m), out<T>(v), n, rule);
@@ -69,7 +89,7 @@ static void adam_(Tensor parameters, const Tensor& gradients, Tensor m, Tensor v
 
 }  // namespace snh
 
-STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
+SNH_OPS(m) {
   m.def(
       "sparse_adam_(Tensor(a!) features, Tensor(b!) grad_features, Tensor(c!) m, Tensor(d!) v, Tensor(e!) "
       "last_step, "
@@ -79,7 +99,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(snh, m) {
       "beta1, "
       "float beta2, float eps) -> ()");
 }
-STABLE_TORCH_LIBRARY_IMPL(snh, CPU, m) {
+SNH_OPS_IMPL(m) {
   m.impl("sparse_adam_", TORCH_BOX(&snh::sparse_adam_));
   m.impl("adam_", TORCH_BOX(&snh::adam_));
 }
