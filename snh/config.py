@@ -73,7 +73,7 @@ class TrackingConfig:
     band: float = _number(0.06, 1e-4)  # m, half length of the sampled part of a ray: T_r
     lambda_color: float = _number(0.001, 0.0)  # lambda_ct of eq. 14
     learning_rate: float = _number(0.003, 0.0)  # per Adam step, m and rad; open in the paper
-    robust_scale: float = _number(0.03, 1e-4)  # m, gauss_newton: residuals beyond it lose weight
+    robust_scale: float = _number(0.06, 1e-4)  # m, gauss_newton: residuals beyond it lose weight
     color_scale: float = _number(0.1, 1e-4)  # gauss_newton: colour differences (0..1) beyond it lose weight
     edge_depth: float = _number(0.05, 0.0)  # rays whose neighbour pixels differ more, relative to depth, are not used
     border: int = _number(4, 0)  # px at the image border that are not used

@@ -8,7 +8,7 @@ import numpy as np
 
 from snh.frame import Camera
 
-N_LEVELS = 3  # full, half and quarter resolution
+N_LEVELS = 4  # full resolution, half, quarter, eighth
 
 
 class Pyramid:

@@ -17,6 +17,9 @@ from snh.slam.pyramid import Pyramid
 from snh.slam.rays import Rays, make_rays, pick_pixels
 
 
+SCHEDULE = (3, 3, 2, 2, 1, 0)  # level of the colour pyramid in each Gauss-Newton iteration; the last one stays
+
+
 @dataclass(frozen=True)
 class Tracked:
     """Pose of a frame and how well it fits the map."""
@@ -119,17 +122,16 @@ class Tracker:
     ) -> np.ndarray:
         """Damped, robust least squares on one draw of rays, until the step is negligible.
 
-        Coarse to fine: three iterations with a quarter of the rays and the colours at a quarter of the resolution,
-        two at half of it, the others on everything.
+        Coarse to fine: the colours by SCHEDULE, with a quarter of the rays while they are coarse.
         """
         config = self.config
         rays, uniforms = self._draw(frame, depth, config.n_rays)
         n, directions = len(rays.depth), rays.dirs_c.numpy()
         for k in range(config.iterations):
-            level = 2 if k < 3 else 1 if k < 5 else 0
-            if k in (0, 3, 5):
+            level = SCHEDULE[min(k, len(SCHEDULE) - 1)]
+            if k == 0 or level != SCHEDULE[min(k, len(SCHEDULE)) - 1]:
                 color = rays.color if level == 0 else torch.from_numpy(colors.sample(level, directions))
-            subset = slice(0, n if k >= 3 else max(1, n // 4))
+            subset = slice(0, n if level < 2 else max(1, n // 4))
             part = Rays(*(t[subset] for t in rays))
             H, g = self._normal_equations(
                 self._residuals(T_wc, part, uniforms[subset], color[subset], reference, level)
