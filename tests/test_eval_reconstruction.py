@@ -11,7 +11,7 @@ from snh.eval import (
     icp_alignment,
     refined,
     sample_points,
-    seen_faces,
+    seen_vertices,
     surface_error,
     virtual_views,
 )
@@ -56,6 +56,11 @@ def box(low, high, cells: int = 20) -> Mesh:
             faces = side.faces if (inward > 0) == (value == low[axis]) else side.faces[:, ::-1]
             sides.append(Mesh(vertices, faces, side.colors))
     return joined(*sides)
+
+
+def seen_faces(mesh: Mesh, *arguments) -> np.ndarray:
+    """Faces [F] bool with a vertex that is seen."""
+    return seen_vertices(mesh, *arguments)[mesh.faces].any(axis=1)
 
 
 @pytest.mark.parametrize(("gap", "f1"), [(0.02, 0.0), (0.008, 100.0)])

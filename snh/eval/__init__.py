@@ -9,7 +9,7 @@ from snh.eval.reconstruction import hidden_surface as hidden_surface
 from snh.eval.reconstruction import icp_alignment as icp_alignment
 from snh.eval.reconstruction import refined as refined
 from snh.eval.reconstruction import sample_points as sample_points
-from snh.eval.reconstruction import seen_faces as seen_faces
+from snh.eval.reconstruction import seen_vertices as seen_vertices
 from snh.eval.reconstruction import surface_error as surface_error
 from snh.eval.reconstruction import virtual_views as virtual_views
 from snh.eval.trajectory import AbsoluteError as AbsoluteError
