@@ -16,7 +16,6 @@ from snh.slam.mapper import twist_gradient
 from snh.slam.pyramid import Pyramid
 from snh.slam.rays import Rays, make_rays, pick_pixels
 
-
 SCHEDULE = (3, 3, 2, 2, 1, 0)  # level of the colour pyramid in each Gauss-Newton iteration; the last one stays
 
 
