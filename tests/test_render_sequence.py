@@ -139,6 +139,19 @@ def test_turning_upright_from_any_world():
             assert np.linalg.det(turned[0, :3, :3]) == pytest.approx(1)
 
 
+def test_clearance_of_a_lopsided_path(room):
+    """Most of this path lies to one side of its centre, so a mirrored one would have another clearance."""
+    grid = render_sequence.ClearanceGrid(GlbScene(room))
+    offsets = np.array([[-0.2, 0, 0], [0.5, 0.1, -0.3], [0.6, 0, -0.4]])
+    clearance = grid.of_path(offsets)
+    for position in ([1.0, 0.2, 0.3], [-1.0, -0.3, 0.9], [0.1, 0.2, 0.1]):
+        index = np.rint((np.array(position) - grid.low) / render_sequence.GRID).astype(int)
+        points = grid.low + index * render_sequence.GRID + offsets
+        expected = (np.array([2, 1.3, 1.5]) - np.abs(points)).min()
+        assert clearance[tuple(index)] == pytest.approx(expected, abs=0.012)  # the picture is 1 cm thick
+    assert clearance[-5, 10, 20] == 0  # reaches out of the room
+
+
 def test_a_path_that_does_not_fit_says_what_is_reachable(room, walk, tmp_path):
     with pytest.raises(DataError, match=r"does not fit .* clearance of 1\.40 m; about 1\.[012]\d m is reachable"):
         run(room, walk, tmp_path / "out", "--clearance", "1.4")
