@@ -24,6 +24,7 @@ import trimesh
 from glb_scene import GlbScene
 from tqdm import tqdm
 
+from snh.datasets.sensor import ColorSensor, DepthSensor, image_flow
 from snh.errors import DataError, OutputError, SNHError
 from snh.frame import Camera
 from snh.geometry import rotation_from_quaternion
@@ -147,14 +148,35 @@ def fit_path(scene: GlbScene, poses: np.ndarray, clearance: float) -> np.ndarray
 
 
 @dataclass(frozen=True)
-class Rendered:
-    rgb: np.ndarray
-    depth: np.ndarray
+class Sensors:
+    """What is done to exact frames; None leaves depth or colour as it is."""
+
+    depth: DepthSensor | None = None
+    color: ColorSensor | None = None
+
+    def __call__(
+        self, rgb: np.ndarray, depth: np.ndarray, camera: Camera, poses: np.ndarray, index: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        flow = None
+        if self.color is not None:
+            if self.color.shutter > 0:
+                T_next = poses[index + 1] if index + 1 < len(poses) else poses[index]
+                flow = image_flow(depth, camera, poses[index], T_next)
+            rgb = self.color(rgb, index, flow)
+        return rgb, depth if self.depth is None else self.depth(depth, camera, index)
 
 
-def render_all(scene: GlbScene, camera: Camera, poses: np.ndarray, jobs: int) -> Iterator[Rendered]:
+def render_all(
+    scene: GlbScene, camera: Camera, poses: np.ndarray, sensors: Sensors, jobs: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Colour and depth of every pose in order, a few frames at the same time."""
+
+    def frame(index: int) -> tuple[np.ndarray, np.ndarray]:
+        rgb, depth = scene.render(camera, poses[index])
+        return sensors(rgb, depth, camera, poses, index)
+
     with ThreadPoolExecutor(jobs) as pool:
-        yield from pool.map(lambda T: Rendered(*scene.render(camera, T)), poses)
+        yield from pool.map(frame, range(len(poses)))
 
 
 def write_frame(folder: Path, index: int, rgb: np.ndarray, depth: np.ndarray) -> None:
@@ -175,6 +197,17 @@ def write_layout(out: Path, scene: GlbScene, camera: Camera, poses: np.ndarray) 
     trimesh.Trimesh(scene.vertices, scene.faces.astype(np.int64), process=False).export(out / "mesh.ply")
 
 
+def make_camera(size: str) -> Camera:
+    try:
+        width, height = (int(n) for n in size.split("x"))
+    except ValueError:
+        raise DataError(f"--size {size} is not WIDTHxHEIGHT, for example 640x480") from None
+    if min(width, height) < 8:
+        raise DataError(f"--size {size} is too small; use at least 8x8")
+    focal = 525 * width / 640
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
 def parse(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="GLB file in metres")
@@ -191,23 +224,39 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--clearance", type=float, default=0.4, help="least distance of the camera to any surface, m")
     parser.add_argument("--shrink", type=float, default=1.0, help="scale of the path's positions")
+    parser.add_argument("--kinect", action="store_true", help="depth as a Kinect measures it, and noise in the colour")
+    parser.add_argument("--exposure", action="store_true", help="exposure and white balance drift")
+    parser.add_argument("--blur", action="store_true", help="motion blur")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise")
     parser.add_argument("--jobs", type=int, default=2, help="frames rendered at the same time")
     return parser.parse_args(argv)
 
 
+def sensors_of(args: argparse.Namespace) -> Sensors:
+    color = ColorSensor(
+        args.seed,
+        exposure=0.15 if args.exposure else 0.0,
+        shutter=0.3 if args.blur else 0.0,
+        noise=2.0 if args.kinect else 0.0,
+    )
+    changed = args.kinect or args.exposure or args.blur
+    return Sensors(DepthSensor(args.seed) if args.kinect else None, color if changed else None)
+
+
 def main(argv: list[str] | None = None) -> None:
     args = parse(argv)
-    width, height = (int(n) for n in args.size.split("x"))
-    focal = 525 * width / 640
-    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    camera = make_camera(args.size)
     poses = read_path(args.path)[args.start :: args.stride][: args.frames]
+    if len(poses) == 0:
+        raise DataError(f"--start {args.start} is past the end of the camera path {args.path}")
     scene = GlbScene(args.scene, args.up)
     upright = turn_upright(poses, scene.up)
     upright[:, :3, 3] *= args.shrink
     poses = fit_path(scene, upright, args.clearance)
     write_layout(args.out, scene, camera, poses)
-    for index, frame in enumerate(tqdm(render_all(scene, camera, poses, args.jobs), total=len(poses))):
-        write_frame(args.out / "results", index, frame.rgb, frame.depth)
+    frames = render_all(scene, camera, poses, sensors_of(args), args.jobs)
+    for index, (rgb, depth) in enumerate(tqdm(frames, total=len(poses))):
+        write_frame(args.out / "results", index, rgb, depth)
 
 
 if __name__ == "__main__":

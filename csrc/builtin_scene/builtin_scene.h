@@ -52,6 +52,7 @@ struct Solid {
   Mat R_ws;
   Vec center;
   Vec half;
+  double radius;  // of the bounding sphere
   Material material;
 };
 
@@ -66,21 +67,27 @@ struct Surface {
   Vec point, normal;
   double u, v;            // m, along the face
   double half_u, half_v;  // m, half extents of the face
+  int face;               // 0, 1, 2: across that axis of a box, cap of a cylinder (2); 3: curved
+};
+
+// What arrives at a point of a surface, 0..1: ambient light (1 = open) and each lamp (1 = lit).
+struct Light {
+  double ambient;
+  std::array<double, 2> lamps;
 };
 
 // Distance to the nearest solid and share of each lamp that arrives, on a grid over the room.
 class LightVolume {
  public:
   void build(const struct Room& room);
-  double ambient(const Vec& point, const Vec& normal) const;      // 0..1, 1 = open
-  double lamp(int k, const Vec& point, const Vec& normal) const;  // 0..1, 1 = lit
+  Light at(const Vec& point, const Vec& normal) const;
 
  private:
-  double at(const std::vector<float>& values, const Vec& point) const;
+  Eigen::Vector4f interpolate(const Vec& point) const;
   Vec low_;
-  Eigen::Array3i n_;
-  std::vector<float> distance_;
-  std::array<std::vector<float>, 2> arriving_;
+  Eigen::Array3i n_;                    // nodes along each axis
+  Eigen::Array4f last_;                 // highest position in cells, just below the last node
+  std::vector<Eigen::Vector4f> nodes_;  // distance in metres, lamp 0, lamp 1, unused
 };
 
 struct Room {

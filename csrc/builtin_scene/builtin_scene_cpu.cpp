@@ -66,52 +66,93 @@ struct LocalView {
   Mat R_sc;
 };
 
+// Where a solid's bounding box lies in the image.
+struct Extent {
+  int u0, u1, v0, v1;  // first and last column and row, empty if last < first
+  std::array<std::array<Eigen::Vector2d, 2>, 12> edges;  // in pixels
+  bool cut;        // reaches behind the camera: the edges do not bound it
+  double nearest;  // least z-depth
+};
+
 struct View {
   const Room& room;
   const Pinhole& camera;
   Mat R_wc;
   Vec origin;
   std::vector<LocalView> local;
-  std::vector<std::array<int, 4>> bounds;  // per solid: first and last column, first and last row
+  std::vector<Extent> extents;
+  std::vector<int> order;  // solids by nearest depth
 
   Vec direction_c(double u, double v) const {
     return Vec((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1);
   }
 };
 
-// Pixels that can see a solid: those inside the projection of its bounding box, all of them if it reaches behind.
-std::array<int, 4> screen_bounds(const Pinhole& camera, const LocalView& view, const Vec& half) {
-  double u0 = kInfinity, u1 = -kInfinity, v0 = kInfinity, v1 = -kInfinity;
-  for (int corner = 0; corner < 8; ++corner) {
-    const Vec p(corner & 1 ? half[0] : -half[0], corner & 2 ? half[1] : -half[1],
-                corner & 4 ? half[2] : -half[2]);
-    const Vec q = view.R_sc.transpose() * (p - view.origin);
-    if (q[2] < 0.01) return {0, camera.width - 1, 0, camera.height - 1};
-    const double u = q[0] / q[2] * camera.fx + camera.cx, v = q[1] / q[2] * camera.fy + camera.cy;
-    u0 = std::min(u0, u), u1 = std::max(u1, u), v0 = std::min(v0, v), v1 = std::max(v1, v);
+// Pixels that can see a solid: the projection of the part of its bounding box in front of the camera.
+Extent make_extent(const Pinhole& camera, const LocalView& view, const Vec& half) {
+  constexpr double kNear = 0.02;  // m
+  std::array<Vec, 8> corner;
+  for (int k = 0; k < 8; ++k) {
+    const Vec p(k & 1 ? half[0] : -half[0], k & 2 ? half[1] : -half[1], k & 4 ? half[2] : -half[2]);
+    corner[k] = view.R_sc.transpose() * (p - view.origin);
   }
-  const auto first = [](double x, int n) {
-    return static_cast<int>(std::clamp(std::floor(x), 0.0, n + 0.0));
-  };
-  const auto last = [](double x, int n) { return static_cast<int>(std::clamp(std::ceil(x), -1.0, n - 1.0)); };
-  return {first(u0, camera.width), last(u1, camera.width), first(v0, camera.height), last(v1, camera.height)};
+  Extent extent{camera.width, -1, camera.height, -1, {}, false, kInfinity};
+  int n = 0;
+  for (int k = 0; k < 8; ++k) {
+    extent.nearest = std::min(extent.nearest, corner[k][2]);
+    for (int bit = 1; bit < 8; bit *= 2) {
+      if (k & bit) continue;
+      std::array<Vec, 2> end{corner[k], corner[k | bit]};
+      if (end[0][2] < end[1][2]) std::swap(end[0], end[1]);
+      if (end[0][2] < kNear) continue;
+      if (end[1][2] < kNear) {
+        end[1] += (end[0] - end[1]) * ((kNear - end[1][2]) / (end[0][2] - end[1][2]));
+        extent.cut = true;
+      }
+      for (int side = 0; side < 2; ++side) {
+        const Vec& q = end[side];
+        const double u = q[0] / q[2] * camera.fx + camera.cx, v = q[1] / q[2] * camera.fy + camera.cy;
+        extent.edges[n][side] = Eigen::Vector2d(u, v);
+        const double right = camera.width, below = camera.height;
+        extent.u0 = std::min(extent.u0, static_cast<int>(std::clamp(std::floor(u), 0.0, right)));
+        extent.u1 = std::max(extent.u1, static_cast<int>(std::clamp(std::ceil(u), -1.0, right - 1)));
+        extent.v0 = std::min(extent.v0, static_cast<int>(std::clamp(std::floor(v), 0.0, below)));
+        extent.v1 = std::max(extent.v1, static_cast<int>(std::clamp(std::ceil(v), -1.0, below - 1)));
+      }
+      ++n;
+    }
+  }
+  return extent;
 }
 
-bool behind(const LocalView& view, const Vec& half) {
-  const Vec forward = view.R_sc.col(2);
-  return forward.dot(-view.origin) + forward.cwiseAbs().dot(half) <= 0;
+// First and last column of row v inside the box's outline, one more on each side against rounding.
+std::array<int, 2> columns(const Extent& extent, int v) {
+  if (extent.cut) return {extent.u0, extent.u1};
+  double first = kInfinity, last = -kInfinity;
+  for (const auto& [a, b] : extent.edges) {
+    if ((a[1] < v && b[1] < v) || (a[1] > v && b[1] > v)) continue;
+    const double rise = b[1] - a[1], t = rise != 0 ? (v - a[1]) / rise : 0;
+    const double u = a[0] + t * (b[0] - a[0]), other = rise != 0 ? u : b[0];
+    first = std::min({first, u, other});
+    last = std::max({last, u, other});
+  }
+  if (first > last) return {0, -1};
+  return {static_cast<int>(std::max<double>(extent.u0, first - 1)),
+          static_cast<int>(std::min<double>(extent.u1, last + 1))};
 }
 
 View make_view(const Room& room, const Pinhole& camera, const double* T_wc) {
   const auto T = Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(T_wc);
-  View view{room, camera, T.topLeftCorner<3, 3>(), T.topRightCorner<3, 1>(), {}, {}};
+  View view{room, camera, T.topLeftCorner<3, 3>(), T.topRightCorner<3, 1>(), {}, {}, {}};
   for (const Solid& solid : room.solids) {
     const LocalView local{solid.R_ws.transpose() * (view.origin - solid.center),
                           solid.R_ws.transpose() * view.R_wc};
+    view.order.push_back(static_cast<int>(view.order.size()));
     view.local.push_back(local);
-    view.bounds.push_back(behind(local, solid.half) ? std::array<int, 4>{0, -1, 0, -1}
-                                                    : screen_bounds(camera, local, solid.half));
+    view.extents.push_back(make_extent(camera, local, solid.half));
   }
+  std::stable_sort(view.order.begin(), view.order.end(),
+                   [&](int a, int b) { return view.extents[a].nearest < view.extents[b].nearest; });
   return view;
 }
 
@@ -119,15 +160,17 @@ View make_view(const Room& room, const Pinhole& camera, const double* T_wc) {
 template <double (*enter)(const Vec&, const Vec&, const Vec&)>
 void cast_solid(const View& view, int number, int begin, int end, float* depth, int* seen) {
   const Pinhole& camera = view.camera;
-  const LocalView& local = view.local[number];
+  const LocalView local = view.local[number];
+  const Extent& extent = view.extents[number];
   const Vec half = view.room.solids[number].half;
-  const auto [u0, u1, v0, v1] = view.bounds[number];
-  for (int v = std::max(v0, begin); v <= std::min(v1, end - 1); ++v) {
-    const Vec row = local.R_sc.col(2) + local.R_sc.col(1) * ((v - camera.cy) / camera.fy);
-    for (int u = u0; u <= u1; ++u) {
-      const Vec d = row + local.R_sc.col(0) * ((u - camera.cx) / camera.fx);
-      const float z = static_cast<float>(enter(half, local.origin, d));
+  const Vec step = local.R_sc.col(0) / camera.fx;
+  for (int v = std::max(extent.v0, begin); v <= std::min(extent.v1, end - 1); ++v) {
+    const Vec row = local.R_sc * view.direction_c(0, v);
+    const auto [first, last] = columns(extent, v);
+    for (int u = first; u <= last; ++u) {
       const int64_t pixel = static_cast<int64_t>(v) * camera.width + u;
+      if (depth[pixel] <= extent.nearest) continue;
+      const float z = static_cast<float>(enter(half, local.origin, row + step * u));
       if (z < depth[pixel]) depth[pixel] = z, seen[pixel] = number;
     }
   }
@@ -137,101 +180,125 @@ void cast_rows(const View& view, int begin, int end, float* depth, int* seen) {
   const int64_t width = view.camera.width;
   std::fill(depth + begin * width, depth + end * width, std::numeric_limits<float>::infinity());
   std::fill(seen + begin * width, seen + end * width, -1);
-  for (int k = 0; k < static_cast<int>(view.room.solids.size()); ++k) {
-    switch (view.room.solids[k].shape) {
+  for (const int number : view.order) {
+    switch (view.room.solids[number].shape) {
       case Shape::box:
-        cast_solid<enter_box>(view, k, begin, end, depth, seen);
+        cast_solid<enter_box>(view, number, begin, end, depth, seen);
         break;
       case Shape::cylinder:
-        cast_solid<enter_cylinder>(view, k, begin, end, depth, seen);
+        cast_solid<enter_cylinder>(view, number, begin, end, depth, seen);
         break;
       case Shape::sphere:
-        cast_solid<enter_sphere>(view, k, begin, end, depth, seen);
+        cast_solid<enter_sphere>(view, number, begin, end, depth, seen);
         break;
     }
   }
 }
 
-// Light that a point of a solid sends out, linear: reflectance x (ambient light, less where things are near, bluish
-// from above and brownish from below, + lamps with distance, angle and shadow).
-Vec radiance(const Room& room, const Solid& solid, const Vec& point, double z, double pixel) {
-  const Surface surface = surface_at(solid, point);
-  const Vec shown = reflectance(solid.material, surface, z * pixel);
-  const Vec linear = shown.cwiseProduct(shown);
-  if (solid.material.glows) return linear;
+// Light that a surface sends out, linear: reflectance x (ambient light, less where things are near, + lamps with
+// distance, angle and shadow). width: of the pixel on the surface, m.
+Vec radiance(const Room& room, const Material& material, const Surface& surface, double width) {
+  const Vec gamma = reflectance(material, surface, width);
+  const Vec linear = gamma.cwiseProduct(gamma);
+  if (material.glows) return linear;
   const double upward = 0.5 + 0.5 * surface.normal[2];
-  Vec light = (Vec(0.30, 0.27, 0.24) * (1 - upward) + Vec(0.36, 0.37, 0.39) * upward) *
-              room.light.ambient(point, surface.normal);
+  const Light arriving = room.light.at(surface.point, surface.normal);
+  Vec light = (Vec(0.42, 0.38, 0.34) * (1 - upward) + Vec(0.46, 0.46, 0.47) * upward) * arriving.ambient;
   for (int k = 0; k < 2; ++k) {
-    const Vec toward = room.lamps[k].position - point;
-    const double cosine = surface.normal.dot(toward) / toward.norm();
-    if (cosine <= 0) continue;
-    const double share = cosine / (0.6 + toward.squaredNorm()) * room.light.lamp(k, point, surface.normal);
-    light += room.lamps[k].color * share;
+    const Vec toward = room.lamps[k].position - surface.point;
+    const double along = surface.normal.dot(toward), distance2 = toward.squaredNorm();
+    if (along > 0)
+      light += room.lamps[k].color * (along / std::sqrt(distance2) / (1 + distance2) * arriving.lamps[k]);
   }
   return linear.cwiseProduct(light);
 }
 
-// Linear light to a screen's 0..255: a soft shoulder that reaches white at 2.5, then gamma 2.
-Vec shown(const Vec& linear) {
-  const Vec x = linear.cwiseMax(0) * 1.25;
-  return (x.array() * (1 + x.array() / 6.25) / (1 + 0.55 * x.array())).min(1).sqrt() * 255;
+// Linear light to a screen's 0..255: a soft shoulder that reaches white at 2, then gamma 2.
+Eigen::Array4f screen_color(const Vec& linear) {
+  Eigen::Array4f x;
+  x << linear.cast<float>().array() * 1.25f, 0;
+  return (x * (1 + x * 0.16f) / (1 + x * 0.55f)).min(1).sqrt() * 255;
 }
 
-Vec shade_ray(const View& view, int number, const Vec& direction_c, double z) {
-  const Vec point = view.origin + view.R_wc * direction_c * z;
-  return shown(radiance(view.room, view.room.solids[number], point, z, 1 / view.camera.fx));
+Eigen::Array4f shade(const View& view, const Solid& solid, const Surface& surface, double z) {
+  return screen_color(radiance(view.room, solid.material, surface, z / view.camera.fx));
 }
 
-void store(const Vec& color, uint8_t* rgb) {
-  for (int c = 0; c < 3; ++c) rgb[c] = static_cast<uint8_t>(std::lround(color[c]));
+void store(const Eigen::Array4f& color, uint8_t* rgb) {
+  for (int c = 0; c < 3; ++c) rgb[c] = static_cast<uint8_t>(color[c] + 0.5f);
 }
 
-void shade_rows(const View& view, int begin, int end, const float* depth, const int* seen, uint8_t* rgb) {
+// Colour of each pixel's centre; the number of the solid in `seen` becomes 4 x number + face.
+void shade_rows(const View& view, int begin, int end, float* depth, int* seen, uint8_t* rgb) {
   for (int v = begin; v < end; ++v)
     for (int u = 0; u < view.camera.width; ++u) {
       const int64_t pixel = static_cast<int64_t>(v) * view.camera.width + u;
-      if (seen[pixel] < 0) continue;
-      store(shade_ray(view, seen[pixel], view.direction_c(u, v), depth[pixel]), rgb + 3 * pixel);
+      if (seen[pixel] < 0) {
+        depth[pixel] = 0;
+        store(Eigen::Array4f::Zero(), rgb + 3 * pixel);
+        continue;
+      }
+      const Solid& solid = view.room.solids[seen[pixel]];
+      const Surface surface =
+          surface_at(solid, view.origin + view.R_wc * view.direction_c(u, v) * depth[pixel]);
+      store(shade(view, solid, surface, depth[pixel]), rgb + 3 * pixel);
+      seen[pixel] = 4 * seen[pixel] + surface.face;
     }
 }
 
-// Solids seen by a pixel and its neighbours, each once; more than one means that an outline is near.
-int seen_around(const View& view, const int* seen, int u, int v, std::array<int, 9>& found) {
+// Solids that a pixel and its eight neighbours see, each once; none unless two of them see different faces.
+int solids_at_outline(const View& view, const int* seen, int u, int v, std::array<int, 9>& found) {
+  const int width = view.camera.width;
+  const int64_t pixel = static_cast<int64_t>(v) * width + u;
+  const int u0 = std::max(u - 1, 0), u1 = std::min(u + 1, width - 1);
+  const int v0 = std::max(v - 1, 0), v1 = std::min(v + 1, view.camera.height - 1);
+  if (seen[pixel - u + u0] == seen[pixel] && seen[pixel - u + u1] == seen[pixel] &&
+      seen[static_cast<int64_t>(v0) * width + u] == seen[pixel] &&
+      seen[static_cast<int64_t>(v1) * width + u] == seen[pixel])
+    return 0;
   int n = 0;
-  for (int y = std::max(v - 1, 0); y <= std::min(v + 1, view.camera.height - 1); ++y)
-    for (int x = std::max(u - 1, 0); x <= std::min(u + 1, view.camera.width - 1); ++x) {
-      const int number = seen[static_cast<int64_t>(y) * view.camera.width + x];
-      if (number >= 0 && std::find(found.begin(), found.begin() + n, number) == found.begin() + n)
-        found[n++] = number;
+  for (int y = v0; y <= v1; ++y)
+    for (int x = u0; x <= u1; ++x) {
+      const int value = seen[static_cast<int64_t>(y) * width + x];
+      if (value >= 0 && std::find(found.begin(), found.begin() + n, value / 4) == found.begin() + n)
+        found[n++] = value / 4;
     }
   return n;
 }
 
-// Mean colour of four rays per pixel on outlines, against the solids that its neighbours see.
+// Colour along one ray against a few solids; false if it hits none of them.
+bool shade_ray(const View& view, const std::array<int, 9>& solids, int n, const Vec& direction_c,
+               Eigen::Array4f& color) {
+  double z = kInfinity;
+  int nearest = -1;
+  for (int k = 0; k < n; ++k) {
+    const LocalView& local = view.local[solids[k]];
+    const Solid& solid = view.room.solids[solids[k]];
+    const double found = intersect(solid.shape, solid.half, local.origin, local.R_sc * direction_c);
+    if (found < z) z = found, nearest = solids[k];
+  }
+  if (nearest < 0) return false;
+  const Solid& solid = view.room.solids[nearest];
+  color = shade(view, solid, surface_at(solid, view.origin + view.R_wc * direction_c * z), z);
+  return true;
+}
+
+// Pixels on outlines become the mean of four rays, cast against what their neighbours see.
 void smooth_rows(const View& view, int begin, int end, const int* seen, uint8_t* rgb) {
-  std::array<int, 9> around;
+  std::array<int, 9> solids;
   for (int v = begin; v < end; ++v)
     for (int u = 0; u < view.camera.width; ++u) {
-      const int n = seen_around(view, seen, u, v, around);
-      if (n < 2) continue;
-      Vec sum = Vec::Zero();
+      const int n = solids_at_outline(view, seen, u, v, solids);
+      Eigen::Array4f sum = Eigen::Array4f::Zero(), color;
       int hits = 0;
-      for (int sub = 0; sub < 4; ++sub) {
-        const Vec d = view.direction_c(u + (sub & 1 ? 0.25 : -0.25), v + (sub & 2 ? 0.25 : -0.25));
-        double z = kInfinity;
-        int nearest = -1;
-        for (int k = 0; k < n; ++k) {
-          const LocalView& local = view.local[around[k]];
-          const Solid& solid = view.room.solids[around[k]];
-          const double found = intersect(solid.shape, solid.half, local.origin, local.R_sc * d);
-          if (found < z) z = found, nearest = around[k];
-        }
-        if (nearest < 0) continue;
-        sum += shade_ray(view, nearest, d, z);
+      for (int part = 0; n > 0 && part < 4; ++part) {
+        const Vec d = view.direction_c(u + (part & 1 ? 0.25 : -0.25), v + (part & 2 ? 0.25 : -0.25));
+        if (!shade_ray(view, solids, n, d, color)) continue;
+        sum += color;
         ++hits;
       }
-      if (hits > 0) store(sum / hits, rgb + 3 * (static_cast<int64_t>(v) * view.camera.width + u));
+      if (hits > 0)
+        store(sum / static_cast<float>(hits), rgb + 3 * (static_cast<int64_t>(v) * view.camera.width + u));
     }
 }
 
@@ -251,8 +318,8 @@ double intersect(Shape shape, const Vec& half, const Vec& origin_s, const Vec& d
 double Room::distance(const Vec& point) const {
   double nearest = kInfinity;
   for (const Solid& solid : solids) {
-    if ((point - solid.center).norm() - solid.half.norm() > nearest)
-      continue;  // its bounding sphere is farther
+    const double reach = nearest + solid.radius;
+    if ((point - solid.center).squaredNorm() > reach * reach) continue;  // its bounding sphere is farther
     nearest = std::min(nearest, solid_distance(solid, point));
   }
   return nearest;
@@ -263,17 +330,17 @@ Surface surface_at(const Solid& solid, const Vec& point) {
   const Vec& h = solid.half;
   if (solid.shape == Shape::sphere) {
     const double r = h[0];
-    return {point, solid.R_ws * p / r, std::atan2(p[1], p[0]) * r, p[2], M_PI * r, r};
+    return {point, solid.R_ws * p / r, std::atan2(p[1], p[0]) * r, p[2], M_PI * r, r, 3};
   }
-  if (solid.shape == Shape::cylinder && h[2] - std::abs(p[2]) > h[0] - std::hypot(p[0], p[1])) {
+  if (solid.shape == Shape::cylinder && h[2] - std::abs(p[2]) > h[0] - std::sqrt(p[0] * p[0] + p[1] * p[1])) {
     const Vec normal = solid.R_ws * Vec(p[0], p[1], 0).normalized();
-    return {point, normal, std::atan2(p[1], p[0]) * h[0], p[2], M_PI * h[0], h[2]};
+    return {point, normal, std::atan2(p[1], p[0]) * h[0], p[2], M_PI * h[0], h[2], 3};
   }
   int axis = 2;
   if (solid.shape == Shape::box) (h - p.cwiseAbs()).minCoeff(&axis);  // the face is where the margin is least
   const int along = axis == 0 ? 1 : 0, across = axis == 2 ? 1 : 2;
   const Vec normal = solid.R_ws.col(axis) * (p[axis] < 0 ? -1 : 1);
-  return {point, normal, p[along], p[across], h[along], h[across]};
+  return {point, normal, p[along], p[across], h[along], h[across], axis};
 }
 
 void render(const Room& room, const Pinhole& camera, const double* T_wc, uint8_t* rgb, float* depth,

@@ -1,6 +1,7 @@
 // Soft light without tracing rays per pixel: distances and shadows are computed once per room on a grid.
 #include <algorithm>
 #include <cmath>
+#include <functional>
 
 #include "builtin_scene/builtin_scene.h"
 
@@ -26,58 +27,66 @@ Vec free_point(const Room& room, const Vec& p, double distance) {
 }  // namespace
 
 // Trilinear; points outside the grid take its border.
-double LightVolume::at(const std::vector<float>& values, const Vec& point) const {
-  int64_t base = 0;
-  double f[3];
-  const int64_t stride[3] = {static_cast<int64_t>(n_[1]) * n_[2], n_[2], 1};
-  for (int k = 0; k < 3; ++k) {
-    const double x = std::clamp((point[k] - low_[k]) / kSpacing, 0.0, n_[k] - 1.001);
-    const int i = static_cast<int>(x);
-    f[k] = x - i;
-    base += i * stride[k];
+Eigen::Vector4f LightVolume::interpolate(const Vec& point) const {
+  Eigen::Array4f x;
+  x << ((point - low_) * (1 / kSpacing)).cast<float>().array(), 0;
+  x = x.max(0).min(last_);
+  const Eigen::Array4i cell = x.cast<int>();
+  const Eigen::Array4f f = x - cell.cast<float>();
+  const int64_t stride[2] = {static_cast<int64_t>(n_[1]) * n_[2], n_[2]};
+  const int64_t base = cell[0] * stride[0] + cell[1] * stride[1] + cell[2];
+  const Eigen::Vector4f* p = nodes_.data() + base;
+  const auto line = [&](int64_t o) -> Eigen::Vector4f { return p[o] + (p[o + 1] - p[o]) * f[2]; };
+  const auto face = [&](int64_t o) -> Eigen::Vector4f {
+    const Eigen::Vector4f near = line(o);
+    return near + (line(o + stride[1]) - near) * f[1];
+  };
+  const Eigen::Vector4f near = face(0);
+  return near + (face(stride[0]) - near) * f[0];
+}
+
+// Open space in front of the surface, close and wide, stands for the share of the sky that it sees.
+Light LightVolume::at(const Vec& point, const Vec& normal) const {
+  constexpr double kClose = 0.07, kWide = 0.40;  // m
+  const Eigen::Vector4f close = interpolate(point + normal * kClose),
+                        wide = interpolate(point + normal * kWide);
+  const double open =
+      0.4 * std::clamp(close[0] / kClose, 0.0, 1.0) + 0.6 * std::clamp(wide[0] / kWide, 0.0, 1.0);
+  return {0.4 + 0.6 * open, {close[1], close[2]}};
+}
+
+namespace {
+
+// Share of a lamp that reaches a point: the least ratio of free width to distance on the way makes the half shadow.
+float arriving(const Vec& start, const Lamp& lamp, const std::function<double(const Vec&)>& free_width) {
+  const double length = (lamp.position - start).norm();
+  const Vec direction = (lamp.position - start) / length;
+  double share = 1;
+  for (double t = 0.06; t < length - kLampGap && share > 0.01;) {
+    const double width = free_width(start + direction * t);
+    share = std::min(share, 0.5 + 0.5 * width / (lamp.softness * (t + 0.1)));
+    t += std::max(width, 0.04);
   }
-  const float* p = values.data() + base;
-  const auto line = [&](int64_t o) { return p[o] + (p[o + 1] - p[o]) * f[2]; };
-  const double near = line(0) + (line(stride[1]) - line(0)) * f[1];
-  const double far = line(stride[0]) + (line(stride[0] + stride[1]) - line(stride[0])) * f[1];
-  return near + (far - near) * f[0];
+  share = std::clamp(share, 0.0, 1.0);
+  return static_cast<float>(share * share * (3 - 2 * share));
 }
 
-double LightVolume::ambient(const Vec& point, const Vec& normal) const {
-  const double close = at(distance_, point + normal * 0.08) / 0.08;
-  const double wide = at(distance_, point + normal * 0.40) / 0.40;
-  return 0.30 + 0.30 * std::clamp(close, 0.0, 1.0) + 0.40 * std::clamp(wide, 0.0, 1.0);
-}
-
-double LightVolume::lamp(int k, const Vec& point, const Vec& normal) const {
-  return at(arriving_[k], point + normal * 0.06);
-}
+}  // namespace
 
 void LightVolume::build(const Room& room) {
   low_ = room.low;
   n_ = ((room.high - room.low) / kSpacing).array().ceil().cast<int>() + 1;
-  const int64_t nodes = static_cast<int64_t>(n_[0]) * n_[1] * n_[2];
-  const auto node = [&](int64_t i) {
+  last_ << n_.cast<float>() - 1.001f, 0;
+  nodes_.assign(static_cast<size_t>(n_[0]) * n_[1] * n_[2], Eigen::Vector4f::Zero());
+  const auto position = [&](int64_t i) {
     return Vec(low_ + kSpacing * Vec(i / n_[2] / n_[1], i / n_[2] % n_[1], i % n_[2]));
   };
-  distance_.resize(nodes);
-  for (int64_t i = 0; i < nodes; ++i) distance_[i] = static_cast<float>(room.distance(node(i)));
-  for (int k = 0; k < 2; ++k) {
-    arriving_[k].resize(nodes);
-    const Lamp& lamp = room.lamps[k];
-    for (int64_t i = 0; i < nodes; ++i) {
-      const Vec start = free_point(room, node(i), distance_[i]);
-      const double length = (lamp.position - start).norm();
-      const Vec direction = (lamp.position - start) / length;
-      double share = 1;  // least ratio of free width to distance on the way: the half shadow
-      for (double t = 0.06; t < length - kLampGap && share > 0.01;) {
-        const double free = at(distance_, start + direction * t);
-        share = std::min(share, 0.5 + 0.5 * free / (lamp.softness * (t + 0.1)));
-        t += std::max(free, 0.04);
-      }
-      share = std::clamp(share, 0.0, 1.0);
-      arriving_[k][i] = static_cast<float>(share * share * (3 - 2 * share));
-    }
+  const auto n = static_cast<int64_t>(nodes_.size());
+  for (int64_t i = 0; i < n; ++i) nodes_[i][0] = static_cast<float>(room.distance(position(i)));
+  const auto free_width = [&](const Vec& point) -> double { return interpolate(point)[0]; };
+  for (int64_t i = 0; i < n; ++i) {
+    const Vec start = free_point(room, position(i), nodes_[i][0]);
+    for (int k = 0; k < 2; ++k) nodes_[i][1 + k] = arriving(start, room.lamps[k], free_width);
   }
 }
 

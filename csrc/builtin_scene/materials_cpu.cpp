@@ -1,6 +1,7 @@
 // Procedural textures. Each is averaged over the pixel's width on the surface, so that nothing flickers when the
 // camera moves: square waves are integrated in closed form, noise fades out where it is finer than the pixels.
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "builtin_scene/builtin_scene.h"
@@ -14,21 +15,37 @@ uint32_t mix_bits(uint32_t x) {
   return x ^ (x >> 16);
 }
 
-// Uniform in [0, 1) for a lattice point.
+// Uniform values on a lattice of 256 x 256 points, repeated; a look-up is several times faster than a hash.
+struct Lattice {
+  std::array<float, 65536> value;
+  Lattice() {
+    for (uint32_t k = 0; k < value.size(); ++k)
+      value[k] = static_cast<float>(mix_bits(k + 1) * (1.0 / 4294967296.0));
+  }
+};
+const Lattice kLattice;
+
+// Uniform in [0, 1) for a lattice point; seeds shift the lattice.
 double random_at(int i, int j, uint32_t seed) {
-  const uint32_t hash =
-      static_cast<uint32_t>(i) * 0x9e3779b1u ^ static_cast<uint32_t>(j) * 0x85ebca77u ^ seed * 0xc2b2ae3du;
-  return mix_bits(hash) * (1.0 / 4294967296.0);
+  const uint32_t column = static_cast<uint32_t>(i) + seed * 101u, row = static_cast<uint32_t>(j) + seed * 37u;
+  return kLattice.value[(row & 255) << 8 | (column & 255)];
 }
 
 double smooth(double x) { return x * x * (3 - 2 * x); }
+// std::floor is a call where the compiler may not assume SSE4.
+int floor_of(double x) {
+  const int i = static_cast<int>(x);
+  return i - (x < i);
+}
+double radius_of(double x, double y) {
+  return std::sqrt(x * x + y * y);
+}  // std::hypot guards overflow, slowly
 double ramp(double x) { return std::clamp(x, 0.0, 1.0); }
 
 // Value noise in [0, 1], lattice spacing 1.
 double noise(double x, double y, uint32_t seed) {
-  const double fx = std::floor(x), fy = std::floor(y);
-  const int i = static_cast<int>(fx), j = static_cast<int>(fy);
-  const double a = smooth(x - fx), b = smooth(y - fy);
+  const int i = floor_of(x), j = floor_of(y);
+  const double a = smooth(x - i), b = smooth(y - j);
   const double top = random_at(i, j, seed) * (1 - a) + random_at(i + 1, j, seed) * a;
   const double bottom = random_at(i, j + 1, seed) * (1 - a) + random_at(i + 1, j + 1, seed) * a;
   return top * (1 - b) + bottom * b;
@@ -48,7 +65,7 @@ double cloud(double x, double y, double width, uint32_t seed) {
 
 // Mean over `width` of the wave that is 1 on [0, duty) of each period 1.
 double wave(double x, double duty, double width) {
-  const auto integral = [duty](double t) { return std::floor(t) * duty + std::min(t - std::floor(t), duty); };
+  const auto integral = [duty](double t) { return floor_of(t) * duty + std::min(t - floor_of(t), duty); };
   width = std::max(width, 1e-4);
   return (integral(x + width / 2) - integral(x - width / 2)) / width;
 }
@@ -73,9 +90,9 @@ Vec wood(const Material& m, double u, double v, double width, uint32_t seed) {
 // Floor boards of width `scale` and 9 times that length, each with its own tone, dark joints between them.
 Vec planks(const Material& m, double u, double v, double width) {
   const double row = v / m.scale, length = 9 * m.scale;
-  const int j = static_cast<int>(std::floor(row));
+  const int j = floor_of(row);
   const double along = u / length + random_at(j, 7, m.seed);
-  const int i = static_cast<int>(std::floor(along));
+  const int i = floor_of(along);
   const double tone = 0.86 + 0.28 * random_at(i, j, m.seed + 1);
   const Vec board = wood(m, u, v, width, m.seed + static_cast<uint32_t>(i * 31 + j)) * tone;
   const double joint =
@@ -107,7 +124,7 @@ Vec carpet(const Material& m, const Surface& s, double width) {
   const Vec accent(0.85, 0.66, 0.38);
   Vec color = blend(m.a, m.b, inside((du + dv - 0.34) * cell, width));
   color = blend(color, accent, inside((du + dv - 0.14) * cell, width));
-  const double ring = std::hypot(s.u / s.half_u, s.v / s.half_v) * std::min(s.half_u, s.half_v);
+  const double ring = radius_of(s.u / s.half_u, s.v / s.half_v) * std::min(s.half_u, s.half_v);
   color = blend(color, m.b, inside(ring - 0.5 * s.half_v, width));
   color = blend(color, accent, inside(std::abs(ring - 0.46 * s.half_v) - 0.015, width));
   color = blend(color, m.a, inside(ring - 0.3 * s.half_v, width));
@@ -120,19 +137,26 @@ Vec carpet(const Material& m, const Surface& s, double width) {
 
 // Staggered blossoms on a ground that is slightly uneven.
 Vec wallpaper(const Material& m, double u, double v, double width) {
-  const double row = std::floor(v / m.scale);
-  const double x = u / m.scale + 0.5 * (row - 2 * std::floor(row / 2));
-  const double dx = x - std::floor(x) - 0.5, dy = v / m.scale - row - 0.5;
-  const double radius = std::hypot(dx, dy), petals = 0.22 + 0.10 * std::cos(6 * std::atan2(dy, dx));
+  const int row = floor_of(v / m.scale);
+  const double x = u / m.scale + 0.5 * (row & 1);
+  const double dx = x - floor_of(x) - 0.5, dy = v / m.scale - row - 0.5;
+  const double radius = radius_of(dx, dy), c = dx * dx / std::max(radius * radius, 1e-9);
+  const double petals = 0.22 + 0.10 * (((32 * c - 48) * c + 18) * c - 1);  // + 0.10 cos(6 angle)
   const double uneven = cloud(u / 0.3, v / 0.3, width / 0.3, m.seed) - 0.5;
   Vec color = blend(m.a, m.b, inside((radius - petals) * m.scale, width));
   color = blend(color, m.a, inside((radius - 0.07) * m.scale, width));
   return color * (1 + 0.12 * uneven);
 }
 
+// Colour of a hue in [0, 1), from a circle of 64.
 Vec hue(double h) {
-  const auto channel = [h](double shift) { return 0.5 + 0.38 * std::cos(6.2831853 * (h + shift)); };
-  return Vec(channel(0), channel(0.33), channel(0.67));
+  static const std::array<Vec, 64> circle = [] {
+    std::array<Vec, 64> made;
+    for (int k = 0; k < 64; ++k)
+      for (int c = 0; c < 3; ++c) made[k][c] = 0.56 + 0.26 * std::cos(2 * M_PI * (k / 64.0 + c / 3.0));
+    return made;
+  }();
+  return circle[static_cast<int>(h * 64) & 63];
 }
 
 // Hills under a sky, or discs over a ground of blocks; b is the frame.
@@ -143,18 +167,18 @@ Vec picture(const Material& m, const Surface& s, double width) {
   Vec color;
   if (m.seed % 2 == 0) {
     color = blend(Vec(0.95, 0.80, 0.62), Vec(0.45, 0.64, 0.86), ramp(0.6 * y + 0.4));
-    color = blend(color, Vec(0.98, 0.93, 0.70), inside(std::hypot(x - 0.35, y - 0.35) - 0.16, w));
+    color = blend(color, Vec(0.98, 0.93, 0.70), inside(radius_of(x - 0.35, y - 0.35) - 0.16, w));
     for (int k = 0; k < 4; ++k) {
       const double ridge = 0.15 - 0.28 * k + 0.45 * (noise(x * (1.2 + 0.5 * k), 0.5, m.seed + k) - 0.5);
       color = blend(color, blend(hue(0.45 - 0.07 * k), m.a, 0.45) * (0.95 - 0.16 * k), inside(y - ridge, w));
     }
   } else {
-    const double i = std::floor(2.5 * x), j = std::floor(2.5 * y);
-    color = blend(m.a, hue(random_at(static_cast<int>(i), static_cast<int>(j), m.seed)), 0.45);
+    const int i = floor_of(2.5 * x), j = floor_of(2.5 * y);
+    color = blend(m.a, hue(random_at(i, j, m.seed)), 0.45);
     for (int k = 0; k < 6; ++k) {
       const double px = 1.6 * random_at(k, 1, m.seed) - 0.8, py = 1.6 * random_at(k, 2, m.seed) - 0.8;
       const double radius = 0.12 + 0.28 * random_at(k, 3, m.seed);
-      color = blend(color, hue(random_at(k, 4, m.seed)), inside(std::hypot(x - px, y - py) - radius, w));
+      color = blend(color, hue(random_at(k, 4, m.seed)), inside(radius_of(x - px, y - py) - radius, w));
     }
   }
   color *= 0.92 + 0.16 * cloud(s.u / 0.04, s.v / 0.04, width / 0.04, m.seed);

@@ -1,15 +1,18 @@
 #include <Eigen/Geometry>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <functional>
+#include <map>
 
 #include "builtin_scene/builtin_scene.h"
 
 namespace snh::builtin {
 namespace {
 
-constexpr double kSagitta = 4e-4;  // m, of chords of curved parts
-constexpr double kNudge = 2e-3;    // m, how far in front of a face the space must be free
+constexpr double kSagitta = 4e-4;   // m, of chords of curved parts
+constexpr double kNudge = 2e-3;     // m, how far in front of a face the space must be free
+constexpr double kSmallest = 0.01;  // m, size at which half buried triangles are split no further
 
 int pieces(double length, double edge) { return std::max(1, static_cast<int>(std::ceil(length / edge))); }
 
@@ -18,6 +21,8 @@ int segments(double radius) {
   return std::max(12, static_cast<int>(std::ceil(M_PI / std::acos(1 - std::min(0.5, kSagitta / radius)))));
 }
 
+using Triangle = std::array<Vec, 3>;
+
 class Tessellator {
  public:
   Tessellator(const Room& room, Mesh& mesh) : room_(room), mesh_(mesh) {}
@@ -25,40 +30,47 @@ class Tessellator {
   // n x m quads of a map of the unit square into the solid's frame; counter-clockwise from outside when
   // d/ds x d/dt points out.
   void patch(const Solid& solid, int n, int m, const std::function<Vec(double, double)>& position) {
-    std::vector<int> index(static_cast<size_t>(n + 1) * (m + 1), -1);
+    shared_.clear();
     const auto world = [&](int i, int j) {
       return Vec(solid.center +
                  solid.R_ws * position(static_cast<double>(i) / n, static_cast<double>(j) / m));
     };
-    const auto triangle = [&](const std::array<std::array<int, 2>, 3>& corner) {
-      std::array<Vec, 3> p;
-      for (int k = 0; k < 3; ++k) p[k] = world(corner[k][0], corner[k][1]);
-      if (!adjoins_free_space(p)) return;
-      Eigen::Vector3i face;
-      for (int k = 0; k < 3; ++k) {
-        int& vertex = index[static_cast<size_t>(corner[k][0]) * (m + 1) + corner[k][1]];
-        if (vertex < 0)
-          vertex = static_cast<int>(mesh_.vertices.size()), mesh_.vertices.push_back(p[k].cast<float>());
-        face[k] = vertex;
-      }
-      mesh_.faces.push_back(face);
-    };
     for (int i = 0; i < n; ++i)
       for (int j = 0; j < m; ++j) {
-        triangle({{{i, j}, {i + 1, j}, {i + 1, j + 1}}});
-        triangle({{{i, j}, {i + 1, j + 1}, {i, j + 1}}});
+        const Vec a = world(i, j), b = world(i + 1, j), c = world(i + 1, j + 1), d = world(i, j + 1);
+        add({a, b, c});
+        add({a, c, d});
       }
   }
 
  private:
-  // Some point just in front of the triangle is inside the room and in no solid.
-  bool adjoins_free_space(const std::array<Vec, 3>& p) const {
+  // Keeps a triangle in front of which the space is free, drops a buried one, and splits one that is half buried
+  // until its parts are small.
+  void add(const Triangle& p) {
     const Vec normal = (p[1] - p[0]).cross(p[2] - p[0]);
-    if (normal.norm() < 1e-12) return false;  // at the poles of spheres and the centres of caps
+    if (normal.norm() < 1e-12) return;  // at the poles of spheres and the centres of caps
     const Vec middle = (p[0] + p[1] + p[2]) / 3, ahead = normal.normalized() * kNudge;
-    if (free(middle + ahead)) return true;
-    return std::any_of(p.begin(), p.end(),
-                       [&](const Vec& q) { return free(q + (middle - q) * 0.02 + ahead); });
+    int n_free = free(middle + ahead);
+    for (const Vec& corner : p) n_free += free(corner + (middle - corner) * 0.02 + ahead);
+    if (n_free == 0) return;
+    if (n_free == 4 || normal.norm() < kSmallest * kSmallest) return keep(p);
+    const Vec ab = (p[0] + p[1]) / 2, bc = (p[1] + p[2]) / 2, ca = (p[2] + p[0]) / 2;
+    add({p[0], ab, ca});
+    add({ab, p[1], bc});
+    add({ca, bc, p[2]});
+    add({ab, bc, ca});
+  }
+
+  void keep(const Triangle& p) {
+    Eigen::Vector3i face;
+    for (int k = 0; k < 3; ++k) {
+      const Eigen::Vector3f position = p[k].cast<float>();
+      const auto [found, is_new] = shared_.try_emplace({position[0], position[1], position[2]},
+                                                       static_cast<int>(mesh_.vertices.size()));
+      if (is_new) mesh_.vertices.push_back(position);
+      face[k] = found->second;
+    }
+    mesh_.faces.push_back(face);
   }
 
   bool free(const Vec& q) const {
@@ -68,6 +80,7 @@ class Tessellator {
 
   const Room& room_;
   Mesh& mesh_;
+  std::map<std::array<float, 3>, int> shared_;  // vertices of the patch in hand, by position
 };
 
 void add_box(Tessellator& out, const Solid& solid, double edge) {

@@ -66,7 +66,8 @@ class Place {
 
  private:
   void add(Shape shape, Vec center, Vec half, const Material& m, const Mat& tilt) const {
-    room_.solids.push_back({shape, R_ * tilt, origin_ + R_ * center, half, m});
+    const double radius = shape == Shape::sphere ? half[0] : half.norm();
+    room_.solids.push_back({shape, R_ * tilt, origin_ + R_ * center, half, radius, m});
   }
 
   Room& room_;
@@ -232,7 +233,7 @@ void window(Place p, double width, double height, double sill) {
   for (const int side : {-1, 0, 1})
     p.box(side * width / 2, -0.03, sill, Vec(0.06, 0.06, height + 0.03), kWhite);
   for (const double z : {0.0, 0.62 * height, height})
-    p.box(0, -0.03, sill + z - 0.03, Vec(width, 0.055, 0.06), kWhite);
+    p.box(0, -0.03, sill + z - 0.03, Vec(width, 0.06, 0.06), kWhite);
   p.box(0, -0.08, sill - 0.06, Vec(width + 0.2, 0.16, 0.03), kWhite);
 }
 
@@ -250,7 +251,7 @@ void radiator(Place p, double width) {
 void door(Place p, const Material& m) {
   p.box(0, -0.02, 0, Vec(0.98, 0.04, 2.09), kWhite);
   p.box(0, -0.035, 0, Vec(0.84, 0.03, 2.02), m);
-  for (const double z : {0.15, 1.05}) p.box(0, -0.053, z, Vec(0.58, 0.012, 0.78), m);
+  for (const double z : {0.15, 1.05}) p.box(0, -0.0465, z, Vec(0.58, 0.012, 0.78), m);
   p.cylinder(0.36, -0.075, 1.0, 0.012, 0.05, kSteel);
   p.roll(0.31, -0.085, 1.03, 0.011, 0.12, kSteel);
 }
@@ -292,7 +293,7 @@ void living_room(Room& room) {
   room.low = Vec(-2.5, -2.0, 0);
   room.high = Vec(2.5, 2.0, 2.7);
   room.lamps = {Lamp{Vec(1.35, -0.55, 1.85), Vec(1.5, 1.35, 1.1), 0.35},
-                Lamp{Vec(-2.1, 0.35, 1.7), Vec(1.9, 2.0, 2.15), 0.5}};
+                Lamp{Vec(-1.75, 0.15, 1.75), Vec(1.9, 2.0, 2.15), 0.5}};
   const Material paint{Pattern::plaster, Vec(0.90, 0.87, 0.80), Vec(0.82, 0.78, 0.70), 0.16, 1};
   const Material accent{Pattern::wallpaper, Vec(0.38, 0.54, 0.56), Vec(0.50, 0.66, 0.66), 0.22, 2};
   const Material warm{Pattern::plaster, Vec(0.88, 0.78, 0.66), Vec(0.82, 0.70, 0.56), 0.20, 3};
@@ -381,7 +382,7 @@ void study(Room& room) {
   room.low = Vec(-2.2, -2.1, 0);
   room.high = Vec(2.2, 2.1, 2.5);
   room.lamps = {Lamp{Vec(0, 0, 1.9), Vec(1.5, 1.38, 1.15), 0.35},
-                Lamp{Vec(0.3, 1.7, 1.6), Vec(1.8, 1.95, 2.1), 0.5}};
+                Lamp{Vec(-0.35, 1.35, 1.7), Vec(1.8, 1.95, 2.1), 0.5}};
   const Material paint{Pattern::plaster, Vec(0.88, 0.86, 0.84), Vec(0.80, 0.78, 0.77), 0.18, 21};
   const Material accent{Pattern::wallpaper, Vec(0.82, 0.74, 0.62), Vec(0.72, 0.52, 0.42), 0.26, 22};
   const Material blue{Pattern::plaster, Vec(0.55, 0.64, 0.74), Vec(0.47, 0.56, 0.67), 0.22, 23};

@@ -6,6 +6,7 @@ No files; depth, poses and mesh are exact. The world is in metres with z up and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -86,6 +87,12 @@ def _looking(heading: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.nda
     return np.stack([cos * level + sin * down, cos * down - sin * level, forward], axis=2)
 
 
+@cache
+def _room(number: int) -> _core.BuiltinRoom:
+    """Rooms never change, and their light takes half a second to compute."""
+    return _core.BuiltinRoom(number)
+
+
 def _parse(text: str, noise: str) -> tuple[int, str]:
     """Variant and noise of "2", "2:kinect" or "kinect"."""
     number, _, given = text.rpartition(":") if not text.isdecimal() else (text, "", noise)
@@ -129,7 +136,7 @@ class BuiltinSequence:
         self.camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         self.name = f"builtin-{variant}" + ("-kinect" if noise == "kinect" else "")
         self._poses = builtin_path(variant, n_frames + 1)  # the last one only for the blur of the frame before it
-        self._room = _core.BuiltinRoom(_PATHS[variant].room)
+        self._room = _room(_PATHS[variant].room)
         self._noisy = noise == "kinect"
         self._depth_sensor, self._color_sensor = DepthSensor(seed), ColorSensor(seed)
 

@@ -15,14 +15,14 @@ class DepthSensor:
     """Structured light as in the first Kinect.
 
     Axial noise is that of Nguyen et al. (3DIMPVT 2012); disparity is measured in steps of 1/8 pixel with a focal
-    length of 585 pixels (at 640 columns) and a baseline of 7.5 cm. Outlines are torn, the projector's shadow beside
-    near objects and surfaces seen at a grazing angle have no reading (0), as has all outside [near, far] m.
+    length of 585 pixels and a baseline of 7.5 cm, whatever the size of the image. Outlines are torn. No
+    reading (0): the projector's shadow beside near objects, surfaces at a grazing angle, all outside [near, far] m.
     """
 
     seed: int = 0
     near: float = 0.4
     far: float = 8.0
-    focal: float = 585.0  # pixels at 640 columns
+    focal: float = 585.0  # pixels
     baseline: float = 0.075  # m
     disparity_step: float = 1 / 8  # pixels
     lateral_px: float = 0.5  # standard deviation of the position of outlines
@@ -41,7 +41,7 @@ class DepthSensor:
         lost |= ~edge & (angle > low + (high - low) * random.random(z.shape, np.float32))
         z = self._torn(z, edge, random)
         z = z + random.standard_normal(z.shape, np.float32) * axial_sigma(z)
-        z = self._quantised(z, camera)
+        z = self._quantised(z)
         lost |= (z < self.near) | (z > self.far)
         return np.where(lost, np.float32(0), z)
 
@@ -53,18 +53,13 @@ class DepthSensor:
         torn[v, u] = z[np.clip(v + shift[0], 0, z.shape[0] - 1), np.clip(u + shift[1], 0, z.shape[1] - 1)]
         return torn
 
-    def _disparity_scale(self, camera: Camera) -> float:
-        return self.focal * camera.width / 640 * self.baseline
-
-    def _quantised(self, z: np.ndarray, camera: Camera) -> np.ndarray:
-        steps = self._disparity_scale(camera) / (np.maximum(z, 0.05) * self.disparity_step)
-        return (self._disparity_scale(camera) / (np.maximum(np.rint(steps), 1) * self.disparity_step)).astype(
-            np.float32
-        )
+    def _quantised(self, z: np.ndarray) -> np.ndarray:
+        scale = self.focal * self.baseline / self.disparity_step
+        return (scale / np.maximum(np.rint(scale / np.maximum(z, 0.05)), 1)).astype(np.float32)
 
     def _shadow(self, z: np.ndarray, camera: Camera) -> np.ndarray:
         """Pixels the projector does not light: its column for them is right of that of a pixel farther right."""
-        column = np.arange(z.shape[1], dtype=np.float32) - np.float32(self._disparity_scale(camera)) / z
+        column = np.arange(z.shape[1], dtype=np.float32) - np.float32(camera.fx * self.baseline) / z
         least_right = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
         return column > least_right + 0.5
 
