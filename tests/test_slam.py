@@ -15,6 +15,7 @@ from snh.slam import SLAM
 from snh.slam.alignment import main_directions
 from snh.slam.keyframes import KeyframeLibrary
 from snh.slam.mapper import PoseOptimizer, twist_gradient
+from snh.slam.pyramid import Pyramid
 from snh.slam.rays import clean_depth, make_rays, pick_pixels
 
 SMALL = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
@@ -50,6 +51,19 @@ def test_rays_pass_through_their_pixels():
     rays = make_rays(small_frame(0), small_frame(0).depth, np.array([0, 17]))
     np.testing.assert_allclose(rays.dirs_c.numpy(), [[-7.5 / 20, -5.5 / 20, 1], [-6.5 / 20, -4.5 / 20, 1]], rtol=1e-6)
     np.testing.assert_allclose(rays.color[1].numpy(), np.array([51, 52, 53]) / 255, rtol=1e-6)
+
+
+def test_every_pyramid_level_shows_the_same_colour_along_a_ray():
+    """On a ramp the mean of pixels is the colour at their centre, whatever the level: a camera off by half a pixel
+    of level 3 would be off by 4 x 2 grey values."""
+    camera = Camera(96, 80, 70.0, 70.0, 47.5, 39.5)
+    v, u = np.mgrid[:80, :96]
+    pyramid = Pyramid(np.stack([2 * u, 2 * v, u + v], axis=-1).astype(np.uint8), camera)
+    directions = camera.rays(stride=9)[2:-2, 2:-2].reshape(-1, 3)
+    assert [level[0].shape[:2] for level in pyramid.levels] == [(80, 96), (40, 48), (20, 24), (10, 12)]
+    for level in range(4):
+        colors = 255 * pyramid.sample(level, directions)
+        np.testing.assert_allclose(colors, 255 * pyramid.sample(0, directions), atol=0.51, err_msg=f"level {level}")
 
 
 # --- keyframes --------------------------------------------------------------------------------------------------
