@@ -47,7 +47,7 @@ format: $(READY)
 # libraries must be the first that the interpreter loads. Leaks are not counted: Python keeps objects until it exits.
 asan: $(READY)
 	@echo "== sanitizers: the op tests with an instrumented build"
-	@SNH_SANITIZE=address,undefined SNH_BUILD=build/asan/native \
+	@SNH_CUDA=off SNH_SANITIZE=address,undefined SNH_BUILD=build/asan/native \
 	  $(BIN)/python setup.py --quiet build --build-base build/asan --build-lib build/asan/lib
 	@LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so.6)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH=build/asan/lib OMP_NUM_THREADS=1 \
