@@ -59,7 +59,7 @@ build: $(VENV)/.requirements
 
 wheel: $(READY)
 	@rm -rf build/lib.*
-	@SNH_CUDA_ARCHITECTURES=all $(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
+	@SNH_BUILD=$(CURDIR)/build/wheel SNH_CUDA_ARCHITECTURES=all $(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
 	@ls dist/*.whl
 
 clean:
