@@ -51,11 +51,17 @@ class Buffer {
 struct ShareMemory {
   Buffer workspace, features, weight_tiles, T_wc;
   std::vector<uint8_t> touched;
+  std::vector<BrickEntry> bricks;
 };
 
 struct Memory {
   Buffer panels;
   std::vector<ShareMemory> shares;
+  int32_t call = 0;
+
+  SimdScratch scratch(size_t share) {
+    return {shares[share].workspace.floats(0), shares[share].bricks.data(), call};
+  }
 };
 
 Memory& memory_of_this_thread() {
@@ -145,13 +151,23 @@ void for_each_share(int64_t n, int n_shares, const ParallelFor& parallel_for, co
   });
 }
 
+// The number of calls has no more bits: forget what earlier ones left.
+void start_over(Memory& memory) {
+  memory.call = 1;
+  for (ShareMemory& share : memory.shares) share.bricks.clear();
+}
+
 // Shares with their memory; no more of them than there is work for.
 int prepare_shares(Memory& memory, const SimdSet& set, const SimdField& field, int n_samples, int64_t n,
                    int n_threads) {
   const int n_shares = static_cast<int>(std::clamp<int64_t>(n, 1, std::max(n_threads, 1)));
   if (memory.shares.size() < static_cast<size_t>(n_shares)) memory.shares.resize(n_shares);
-  for (int k = 0; k < n_shares; ++k)
-    memory.shares[k].workspace.floats(set.workspace_floats(field, n_samples));
+  if (++memory.call == (1 << 30)) start_over(memory);
+  for (int k = 0; k < n_shares; ++k) {
+    ShareMemory& share = memory.shares[k];
+    share.workspace.floats(set.workspace_floats(field, n_samples));
+    if (share.bricks.size() < static_cast<size_t>(field.n_bricks)) share.bricks.resize(field.n_bricks);
+  }
   return n_shares;
 }
 
@@ -232,7 +248,7 @@ void field_map(const std::string& name, const FieldSpec& spec, const FieldModel<
   std::vector<SimdMapShare> shares(n_shares);
   for (int k = 0; k < n_shares; ++k) {
     ShareMemory& own = memory.shares[k];
-    shares[k].workspace = own.workspace.floats(0);
+    shares[k].scratch = memory.scratch(k);
     if (!map.with_gradients) continue;
     own.touched.resize(std::max<size_t>(own.touched.size(), field.n_bricks));
     shares[k].grad_features = k ? own.features.floats(field.n_bricks * kBrickFloats) : gradients.features;
@@ -263,7 +279,7 @@ void field_track(const std::string& name, const FieldSpec& spec, const FieldMode
   const SimdTrack track{plain(rays), n_samples, band, residuals, jacobian, valid};
   const int n_shares = prepare_shares(memory, set, field, n_samples, rays.n_rays, n_threads);
   for_each_share(rays.n_rays, n_shares, parallel_for, [&](size_t k, int64_t begin, int64_t end) {
-    set.track_rays(field, track, begin, end, memory.shares[k].workspace.floats(0));
+    set.track_rays(field, track, begin, end, memory.scratch(k));
   });
 }
 
@@ -275,7 +291,7 @@ void field_query(const std::string& name, const FieldSpec& spec, const FieldMode
   const SimdField field = pack(spec, model, memory.panels);
   const int n_shares = prepare_shares(memory, set, field, 1, n_points, n_threads);
   for_each_share(n_points, n_shares, parallel_for, [&](size_t k, int64_t begin, int64_t end) {
-    set.query_points(field, points, begin, end, tsdf, color, valid, memory.shares[k].workspace.floats(0));
+    set.query_points(field, points, begin, end, tsdf, color, valid, memory.scratch(k));
   });
 }
 

@@ -8,7 +8,8 @@
 
 namespace snh {
 
-constexpr int kPanel = 8;  // outputs that one register tile of a layer computes
+constexpr int kPanel = 8;       // outputs that one register tile of a layer computes
+constexpr int kFeatureRow = 4;  // floats
 
 constexpr int round_up(int n, int multiple) { return (n + multiple - 1) / multiple * multiple; }
 
@@ -21,6 +22,21 @@ struct SimdLayer {
 
 struct SimdMlp {
   SimdLayer layer[3];
+};
+
+// What is known of a brick: its key again and the numbers of the bricks (i+1, j), (i, j+1), (i+1, j+1) beside it, -1 =
+// absent. Filled on demand, one per brick and share.
+struct BrickEntry {
+  int64_t key;
+  int32_t beside[3];
+  int32_t stamp;  // 2 x number of the call that filled it, + 1 if all four bricks have all their vertices
+};
+
+// What a share works with: memory that nobody else touches, kept between calls.
+struct SimdScratch {
+  float* workspace;
+  BrickEntry* bricks;  // [B]
+  int32_t call;        // > 0, new in each call
 };
 
 // The model and the spec, as one call sees them.
@@ -50,7 +66,7 @@ struct SimdMapShare {
   uint8_t* touched;
   float* grad_T_wc;     // [M, 3, 4]
   float* weight_tiles;  // gradient of the decoder in the order of the register tiles
-  float* workspace;
+  SimdScratch scratch;
 };
 
 struct SimdMap {
@@ -78,9 +94,9 @@ struct SimdSet {
   // Adds the gradient in `weight_tiles` to the flat decoder's and clears it.
   void (*add_weight_tiles)(const SimdField& field, float* weight_tiles, float* grad_decoder);
   void (*track_rays)(const SimdField& field, const SimdTrack& track, int64_t begin, int64_t end,
-                     float* workspace);
+                     const SimdScratch& scratch);
   void (*query_points)(const SimdField& field, const float* points, int64_t begin, int64_t end, float* tsdf,
-                       float* color, bool* valid, float* workspace);
+                       float* color, bool* valid, const SimdScratch& scratch);
 };
 
 namespace baseline {
