@@ -33,6 +33,7 @@ struct Block {
   float* base_z;                        // [2 S] strata before merging
   int32_t* active;                      // columns of the samples whose colour is decoded
   int32_t* active_end;                  // per ray: end of its run in `active`
+  bool* valid;                          // all vertices of the look-up exist
   Lookup lookup;
   MlpRows geometry, color;  // color: the active samples only, dense
 
@@ -86,6 +87,7 @@ Block carve(Carver& carver, const SimdField& field, int n_samples) {
   block.color_grad_x = rows(3);
   block.jacobian = rows(field.n_levels * kJacobianFloats);
   block.base_z = carver.floats(2 * n_samples);
+  block.valid = reinterpret_cast<bool*>(carver.ints(ld));
   block.active = carver.ints(ld);
   block.active_end = carver.ints(n_rays);
   const int64_t n_pairs = ld * n_cells * 2;
@@ -105,12 +107,10 @@ int64_t workspace_floats(const SimdField& field, int n_samples) {
   return counter.used;
 }
 
-Block start(const SimdField& field, int n_samples, const SimdScratch& scratch, uint8_t* touched) {
-  Carver carver{scratch.workspace};
+Block start(const SimdField& field, int n_samples, float* workspace, uint8_t* touched) {
+  Carver carver{workspace};
   Block block = carve(carver, field, n_samples);
-  block.lookup.touched = touched;
-  block.lookup.bricks = scratch.bricks;
-  block.lookup.call = scratch.call;
+  block.lookup.touched = touched ? touched + 1 : nullptr;
   return block;
 }
 
@@ -194,14 +194,14 @@ SNH_INLINE void positional_backward(const SimdField& field, const float* gamma, 
 }
 
 template <bool kJacobian, bool kValid>
-void encode(const SimdField& field, Block& block, int32_t* valid) {
+void encode(const SimdField& field, Block& block, bool* valid) {
   const int64_t ld = block.ld, jacobian_floats = static_cast<int64_t>(field.n_levels) * kJacobianFloats;
   float* encoded = block.geometry.input + 6 * field.n_octaves * ld;
   block.lookup.n_odd = 0;
   for (int n = 0; n < block.n_padded; n += W) {
     const vec x[3] = {load(block.x + n), load(block.x + ld + n), load(block.x + 2 * ld + n)};
-    const veci exists = find_corners<kValid>(field, block.lookup, x, n / W);
-    if (kValid) store(valid + n, exists);
+    const uint32_t missing = find_corners<kValid>(field, block.lookup, x, n / W);
+    for (int l = 0; kValid && l < W; ++l) valid[n + l] = !((missing >> l) & 1);
     encode_points<kJacobian>(field, block.lookup, n / W, ld, encoded, block.jacobian + n * jacobian_floats);
     positional_encoding(field, block.x, block.geometry.input, n, ld);
   }
@@ -465,7 +465,7 @@ void map_block(const SimdField& field, const SimdMap& map, SimdMapShare& share, 
 
 void map_rays(const SimdField& field, const SimdMap& map, SimdMapShare& share) {
   const int S = map.n_base + map.n_surface, n_rays = block_rays(S);
-  Block block = start(field, S, share.scratch, share.touched);
+  Block block = start(field, S, share.workspace, share.touched);
   RaySums sums[kBlockPoints];
   for (int64_t r = share.begin; r < share.end; r += n_rays) {
     const int64_t rest = share.end - r;
@@ -485,11 +485,11 @@ void add_weight_tiles(const SimdField& field, float* weight_tiles, float* grad_d
 // --- the track form -----------------------------------------------------------------------------------------------
 
 // Residuals, Jacobian and validity of one ray, from tsdf and its gradient in grad_x.
-void write_track(const SimdField& field, const SimdTrack& track, const Block& block, const int32_t* valid,
-                 const Ray& ray, int first, int64_t out) {
+void write_track(const SimdField& field, const SimdTrack& track, const Block& block, const Ray& ray,
+                 int first, int64_t out) {
   for (int n = first; n < first + track.n_samples; ++n, ++out) {
     track.residuals[out] = field.truncation * block.tsdf()[n] - block.ahead[n];
-    track.valid[out] = valid[n] != 0;
+    track.valid[out] = block.valid[n];
     float h[3], p[3];  // T_r R^T ds/dp_w and the point, camera frame
     for (int a = 0; a < 3; ++a) {
       h[a] = 0;
@@ -515,20 +515,19 @@ void track_block(const SimdField& field, const SimdTrack& track, Block& block, i
     place_points(block, ray, r * S, S);
   }
   pad_points(block, n_rays * S);
-  int32_t* valid = block.active;
-  encode<true, true>(field, block, valid);
+  encode<true, true>(field, block, block.valid);
   mlp_forward(field.geometry, block.geometry, block.n_padded, block.ld);
   for (int n = 0; n < block.n_padded; n += W) store(block.grad_tsdf() + n, splat(1.f));
   mlp_backward(field.geometry, block.geometry, 1, block.n_padded, block.ld);
   encode_backward<false>(field, block, nullptr);
   for (int r = 0; r < n_rays; ++r)
-    write_track(field, track, block, valid, ray_at(track.rays, first_ray + r), r * S, (first_ray + r) * S);
+    write_track(field, track, block, ray_at(track.rays, first_ray + r), r * S, (first_ray + r) * S);
 }
 
 void track_rays(const SimdField& field, const SimdTrack& track, int64_t begin, int64_t end,
-                const SimdScratch& scratch) {
+                float* workspace) {
   const int n_rays = block_rays(track.n_samples);
-  Block block = start(field, track.n_samples, scratch, nullptr);
+  Block block = start(field, track.n_samples, workspace, nullptr);
   for (int64_t r = begin; r < end; r += n_rays)
     track_block(field, track, block, r, end - r < n_rays ? static_cast<int>(end - r) : n_rays);
 }
@@ -542,12 +541,11 @@ void query_block(const SimdField& field, Block& block, const float* points, int 
     block.active[k] = k;
   }
   pad_points(block, n);
-  int32_t* exists = reinterpret_cast<int32_t*>(block.weight);
-  encode<false, true>(field, block, exists);
+  encode<false, true>(field, block, block.valid);
   mlp_forward(field.geometry, block.geometry, block.n_padded, block.ld);
   for (int k = 0; k < n; ++k) {
     tsdf[k] = block.tsdf()[k];
-    valid[k] = exists[k] != 0;
+    valid[k] = block.valid[k];
   }
   if (!color) return;
   decode_color(field, block, block.active, n);
@@ -557,8 +555,8 @@ void query_block(const SimdField& field, Block& block, const float* points, int 
 }
 
 void query_points(const SimdField& field, const float* points, int64_t begin, int64_t end, float* tsdf,
-                  float* color, bool* valid, const SimdScratch& scratch) {
-  Block block = start(field, 1, scratch, nullptr);
+                  float* color, bool* valid, float* workspace) {
+  Block block = start(field, 1, workspace, nullptr);
   for (int64_t n = begin; n < end; n += kBlockPoints) {
     const int count = end - n < kBlockPoints ? static_cast<int>(end - n) : kBlockPoints;
     query_block(field, block, points + n * 3, count, tsdf + n, color ? color + n * 3 : nullptr, valid + n);

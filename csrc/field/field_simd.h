@@ -24,19 +24,10 @@ struct SimdMlp {
   SimdLayer layer[3];
 };
 
-// What is known of a brick: its key again and the numbers of the bricks (i+1, j), (i, j+1), (i+1, j+1) beside it, -1 =
-// absent. Filled on demand, one per brick and share.
-struct BrickEntry {
-  int64_t key;
-  int32_t beside[3];
-  int32_t stamp;  // 2 x number of the call that filled it, + 1 if all four bricks have all their vertices
-};
-
-// What a share works with: memory that nobody else touches, kept between calls.
-struct SimdScratch {
-  float* workspace;
-  BrickEntry* bricks;  // [B]
-  int32_t call;        // > 0, new in each call
+// Where the bricks of one level and plane lie in the directory: brick (i, j) at first + (i - i0) * n_j + (j - j0), for
+// i - i0 in [0, n_i) and j - j0 in [0, n_j). Place 0 of the directory is an absent brick.
+struct BrickGrid {
+  int32_t i0, j0, n_i, n_j, first;
 };
 
 // The model and the spec, as one call sees them.
@@ -48,6 +39,9 @@ struct SimdField {
   int64_t capacity;
   const int64_t *brick_keys, *masks;
   int64_t n_bricks;
+  const int32_t*
+      directory;  // 2 x number + 1 if the brick has all its vertices, or -1; null: ask the hash table
+  BrickGrid grids[kMaxLevels * kPlanes];
   const float* features;
   SimdMlp geometry, color;
 };
@@ -63,10 +57,10 @@ struct SimdMapShare {
   int64_t begin, end;  // rays
   double losses[4];    // sums over its rays
   float* grad_features;
-  uint8_t* touched;
+  uint8_t* touched;     // [1 + B]; the first is for absent bricks
   float* grad_T_wc;     // [M, 3, 4]
   float* weight_tiles;  // gradient of the decoder in the order of the register tiles
-  SimdScratch scratch;
+  float* workspace;
 };
 
 struct SimdMap {
@@ -94,9 +88,9 @@ struct SimdSet {
   // Adds the gradient in `weight_tiles` to the flat decoder's and clears it.
   void (*add_weight_tiles)(const SimdField& field, float* weight_tiles, float* grad_decoder);
   void (*track_rays)(const SimdField& field, const SimdTrack& track, int64_t begin, int64_t end,
-                     const SimdScratch& scratch);
+                     float* workspace);
   void (*query_points)(const SimdField& field, const float* points, int64_t begin, int64_t end, float* tsdf,
-                       float* color, bool* valid, const SimdScratch& scratch);
+                       float* color, bool* valid, float* workspace);
 };
 
 namespace baseline {

@@ -12,9 +12,6 @@
 
 namespace snh::SNH_SIMD {
 
-// Values of `touched`: the brick of a point's cell gets a gradient, a neighbour of it perhaps.
-constexpr uint8_t kTouched = 1, kPerhapsTouched = 2;
-
 // A cell whose four rows do not lie in two pairs.
 struct OddCell {
   int32_t at;       // its first address in `pair`
@@ -29,117 +26,96 @@ struct Lookup {
   OddCell* odd;
   float* scratch;  // [odd cell][4 rows]
   int n_odd;
-  BrickEntry* bricks;  // [B]
-  int32_t call;        // entries of `bricks` with another stamp are old
-  uint8_t* touched;    // null: no gradients wanted
+  uint8_t* touched;  // [B]: set to 1 for bricks that get a gradient, also at -1; null: none wanted
 };
 
 SNH_INLINE int64_t pairs_per_group(const SimdField& field) {
   return static_cast<int64_t>(field.n_levels) * kPlanes * 2 * W;
 }
 
-// hash_brick of a vector of bricks.
-SNH_INLINE vecu hash_bricks(uint32_t head, veci i, veci j) {
-  vecu h = (reinterpret_cast<vecu>(i) * 0x9E3779B1u) ^ (reinterpret_cast<vecu>(j) * 0x85EBCA77u) ^
-           (head * 0xC2B2AE3Du);
-  h ^= h >> 15;
-  h *= 0x2C1B3C6Du;
-  return h ^ (h >> 13);
-}
-
-// Asks the hash table for brick `key`, whose number `own` may be -1, and for the three beside it.
-inline __attribute__((noinline)) void fill(BrickEntry& entry, const SimdField& field, const Lookup& lookup,
-                                           int64_t key, int32_t own) {
-  const Brick brick = unpack_key(key);
-  bool full = own >= 0 && field.masks[own] == -1;
-  if (lookup.touched && own >= 0) lookup.touched[own] |= kTouched;
-  for (int c = 1; c < 4; ++c) {
-    const int32_t next = find_brick(brick.level, brick.plane, brick.i + (c & 1), brick.j + (c >> 1),
-                                    field.probe, field.capacity, field.brick_keys);
-    entry.beside[c - 1] = next;
-    full = full && next >= 0 && field.masks[next] == -1;
-    if (lookup.touched && next >= 0) lookup.touched[next] |= kPerhapsTouched;
+// Directory entry of one brick: 2 x number + 1 if it has all its vertices, -1 = absent.
+SNH_INLINE int32_t find_entry(const SimdField& field, int level, int plane, int32_t i, int32_t j) {
+  if (field.directory) {
+    const BrickGrid& grid = field.grids[level * kPlanes + plane];
+    const uint32_t a = static_cast<uint32_t>(i - grid.i0), b = static_cast<uint32_t>(j - grid.j0);
+    const bool inside = a < static_cast<uint32_t>(grid.n_i) && b < static_cast<uint32_t>(grid.n_j);
+    return inside ? field.directory[grid.first + static_cast<int32_t>(a) * grid.n_j + static_cast<int32_t>(b)]
+                  : -1;
   }
-  entry.key = key;
-  entry.stamp = lookup.call * 2 + full;
+  const int32_t number = find_brick(level, plane, i, j, field.probe, field.capacity, field.brick_keys);
+  return number < 0 ? -1 : number * 2 + (field.masks[number] == -1);
 }
 
-// The entry of brick `key`; `own` becomes its number. `absent` serves bricks that do not exist.
-SNH_INLINE const BrickEntry& find_entry(const SimdField& field, const Lookup& lookup, int64_t key,
-                                        uint32_t hash, int32_t& own, BrickEntry& absent) {
-  own = field.capacity ? field.probe[hash & static_cast<uint32_t>(field.capacity - 1)] : -1;
-  if (__builtin_expect(own >= 0, 1)) {
-    const BrickEntry& entry = lookup.bricks[own];
-    if (__builtin_expect((entry.stamp >> 1 == lookup.call) & (entry.key == key), 1)) return entry;
+SNH_INLINE veci find_entries(const SimdField& field, int level, int plane, veci i, veci j) {
+  if (field.directory) {
+    const BrickGrid& grid = field.grids[level * kPlanes + plane];
+    const veci a = i - grid.i0, b = j - grid.j0;
+    const veci inside = (a >= 0) & (a < grid.n_i) & (b >= 0) & (b < grid.n_j);
+    return gather(field.directory, inside & (grid.first + a * grid.n_j + b));
   }
-  own = find_key(key, hash, field.probe, field.capacity, field.brick_keys);
-  BrickEntry& entry = own >= 0 ? lookup.bricks[own] : absent;
-  if (own < 0 || entry.stamp >> 1 != lookup.call) fill(entry, field, lookup, key, own);
-  return entry;
-}
-
-// Numbers of the four bricks (i + c % 2, j + c / 2) of each lane; false if some of them lack vertices. Consecutive
-// samples of a ray share bricks, so the hash table is asked once per run of equal lanes, and for the bricks beside
-// once per brick and call.
-SNH_INLINE bool find_bricks(const SimdField& field, const Lookup& lookup, int level, int plane, veci i,
-                            veci j, veci (&number)[4]) {
-  int32_t lane_i[W], lane_j[W], lane_hash[W];
+  int32_t lane_i[W], lane_j[W];
   store(lane_i, i);
   store(lane_j, j);
-  store(lane_hash, reinterpret_cast<veci>(hash_bricks(static_cast<uint32_t>(level * 4 + plane), i, j)));
-  uint32_t first_of_run = bits((i != from_lane_before(i)) | (j != from_lane_before(j))) | 1;
-  int32_t full = 1;
-  for (veci& one : number) one = veci{};
-  while (first_of_run) {
-    const int l = __builtin_ctz(first_of_run);
-    first_of_run &= first_of_run - 1;
-    int32_t own;
-    BrickEntry absent;
-    const BrickEntry& entry = find_entry(field, lookup, pack_key(level, plane, lane_i[l], lane_j[l]),
-                                         static_cast<uint32_t>(lane_hash[l]), own, absent);
-    const veci from_here = lanes() >= l;
-    number[0] = from_here ? splat(own) : number[0];
-    for (int c = 1; c < 4; ++c) number[c] = from_here ? splat(entry.beside[c - 1]) : number[c];
-    full &= entry.stamp;
-  }
-  return full & 1;
+  for (int l = 0; l < W; ++l) lane_i[l] = find_entry(field, level, plane, lane_i[l], lane_j[l]);
+  return load(lane_i);
 }
 
-// Whether vertex `local` of brick `number` exists, by lane.
-SNH_INLINE veci vertex_exists(const SimdField& field, veci number, veci local) {
+// Whether vertex `slot` exists, by lane; a negative one does not.
+SNH_INLINE veci vertex_exists(const SimdField& field, veci slot) {
   if (field.n_bricks == 0) return veci{};
-  const veci safe = number < 0 ? veci{} : number;
-  const veci word = gather(reinterpret_cast<const int32_t*>(field.masks), safe * 2 + (local >> 5));
-  return (number >= 0) & (((word >> (local & 31)) & 1) != 0);
+  const veci word = gather(reinterpret_cast<const int32_t*>(field.masks), (slot < 0 ? veci{} : slot) >> 5);
+  return (slot >= 0) & (((word >> (slot & 31)) & 1) != 0);
+}
+
+SNH_INLINE void touch(uint8_t* touched, veci number) {
+  int32_t lane[W];
+  store(lane, number);
+  for (int l = 0; l < W; ++l) touched[lane[l]] = 1;
 }
 
 alignas(16) static const float kZeroRow[kFeatureRow] = {0, 0, 0, 0};
 
-// Points the odd lanes of a cell to copies of their rows.
-SNH_INLINE void copy_odd_cells(const SimdField& field, Lookup& lookup, uint32_t odd, const veci (&slot)[4],
-                               int64_t at) {
-  int32_t lane_slot[4][W];
-  for (int c = 0; c < 4; ++c) store(lane_slot[c], slot[c]);
+// Points the odd lanes of a cell to copies of their rows. `low` and `high` are the entries of the bricks of (i, j) and
+// (i, j+1). Returns the lanes where not all four vertices exist.
+template <bool kValid>
+SNH_INLINE uint32_t copy_odd_cells(const SimdField& field, Lookup& lookup, uint32_t odd, int level, int plane,
+                                   veci i, veci j, veci low, veci high, int64_t at) {
+  int32_t lane_i[W], lane_j[W], lane_entry[2][W];
+  store(lane_i, i);
+  store(lane_j, j);
+  store(lane_entry[0], low);
+  store(lane_entry[1], high);
+  uint32_t missing = 0;
   for (; odd; odd &= odd - 1) {
     const int l = __builtin_ctz(odd);
     OddCell& cell = lookup.odd[lookup.n_odd];
     float* rows = lookup.scratch + static_cast<int64_t>(lookup.n_odd++) * kOddFloats;
     cell.at = static_cast<int32_t>(at + l);
+    const bool cross_i = (lane_i[l] & (kBrickSide - 1)) == kBrickSide - 1;
     for (int c = 0; c < 4; ++c) {
-      const int32_t s = cell.slot[c] = lane_slot[c][l];
+      const int32_t vi = lane_i[l] + (c & 1), vj = lane_j[l] + (c >> 1);
+      int32_t number = lane_entry[c >> 1][l] >> 1;
+      if ((c & 1) && cross_i) {
+        number = find_entry(field, level, plane, vi >> kBrickBits, vj >> kBrickBits) >> 1;
+        if (lookup.touched) lookup.touched[number] = 1;
+      }
+      const int32_t slot = cell.slot[c] = number * kBrickVertices + local_of(vi, vj);
       store4(rows + c * kFeatureRow,
-             load4(s < 0 ? kZeroRow : field.features + static_cast<int64_t>(s) * kFeatureRow));
+             load4(slot < 0 ? kZeroRow : field.features + static_cast<int64_t>(slot) * kFeatureRow));
+      if (kValid && (slot < 0 || !((field.masks[number] >> (slot & (kBrickVertices - 1))) & 1)))
+        missing |= 1u << l;
     }
     lookup.pair[at + l] = rows;
     lookup.pair[at + W + l] = rows + 2 * kFeatureRow;
   }
+  return missing;
 }
 
-// First stage for the W points of a group. kValid: returns in which lanes all vertices exist.
+// First stage for the W points of a group. kValid: returns the lanes where not all vertices exist.
 template <bool kValid>
-SNH_INLINE veci find_corners(const SimdField& field, Lookup& lookup, const vec (&x)[3], int group) {
-  veci exists = splat(-1);
+SNH_INLINE uint32_t find_corners(const SimdField& field, Lookup& lookup, const vec (&x)[3], int group) {
   const veci side = splat(kBrickSide - 1);
+  uint32_t missing = 0;
   int64_t at = group * pairs_per_group(field);
   for (int level = 0; level < field.n_levels; ++level) {
     vec fraction[3];
@@ -153,28 +129,34 @@ SNH_INLINE veci find_corners(const SimdField& field, Lookup& lookup, const vec (
     }
     for (int plane = 0; plane < kPlanes; ++plane, at += 2 * W) {
       const veci i = index[axis_u(plane)], j = index[axis_v(plane)];
-      veci number[4];
-      const bool full = find_bricks(field, lookup, level, plane, i >> kBrickBits, j >> kBrickBits, number);
-      const veci cross_i = (i & side) == side, cross_j = (j & side) == side;
-      number[1] = cross_i ? number[1] : number[0];
-      number[3] = cross_i ? number[3] : number[2];
-      number[2] = cross_j ? number[2] : number[0];
-      number[3] = cross_j ? number[3] : number[1];
-      veci slot[4];
-      for (int c = 0; c < 4; ++c) {
-        const veci local = ((i + (c & 1)) & side) | (((j + (c >> 1)) & side) << kBrickBits);
-        slot[c] = number[c] * kBrickVertices + local;
-        if (kValid && !full) exists &= vertex_exists(field, number[c], local);
-      }
-      store_addresses(lookup.pair + at, field.features, slot[0]);
-      store_addresses(lookup.pair + at + W, field.features, slot[2]);
+      const veci low = find_entries(field, level, plane, i >> kBrickBits, j >> kBrickBits);
+      veci high = low;  // of the pair at j+1
+      const veci cross_j = (j & side) == side;
+      const bool any_cross_j = bits(cross_j) != 0;
+      if (any_cross_j)
+        high = cross_j ? find_entries(field, level, plane, i >> kBrickBits, (j >> kBrickBits) + 1) : low;
+
+      const veci slot = (low >> 1) * kBrickVertices + ((i & side) | ((j & side) << kBrickBits));
+      const veci high_slot = (high >> 1) * kBrickVertices + ((i & side) | (((j + 1) & side) << kBrickBits));
+      store_addresses(lookup.pair + at, field.features, slot);
+      store_addresses(lookup.pair + at + W, field.features, high_slot);
       store(lookup.fraction + at, fraction[axis_u(plane)]);
       store(lookup.fraction + at + W, fraction[axis_v(plane)]);
-      const uint32_t odd = bits(cross_i | (slot[0] < 0) | (slot[2] < 0));
-      if (odd) copy_odd_cells(field, lookup, odd, slot, at);
+
+      const uint32_t odd = bits(((i & side) == side) | (low < 0) | (high < 0));
+      if (kValid && bits((low & high & 1) == 0) & ~odd) {
+        const veci exist = vertex_exists(field, slot) & vertex_exists(field, slot + 1) &
+                           vertex_exists(field, high_slot) & vertex_exists(field, high_slot + 1);
+        missing |= ~bits(exist) & ~odd;
+      }
+      if (lookup.touched) {
+        touch(lookup.touched, low >> 1);
+        if (any_cross_j) touch(lookup.touched, high >> 1);
+      }
+      if (odd) missing |= copy_odd_cells<kValid>(field, lookup, odd, level, plane, i, j, low, high, at);
     }
   }
-  return exists;
+  return missing;
 }
 
 // Weights of a pair at fraction u: 1 - u and u, each for a row.
