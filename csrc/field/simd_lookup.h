@@ -33,19 +33,7 @@ SNH_INLINE int64_t pairs_per_group(const SimdField& field) {
   return static_cast<int64_t>(field.n_levels) * kPlanes * 2 * W;
 }
 
-// Directory entry of one brick: 2 x number + 1 if it has all its vertices, -1 = absent.
-SNH_INLINE int32_t find_entry(const SimdField& field, int level, int plane, int32_t i, int32_t j) {
-  if (field.directory) {
-    const BrickGrid& grid = field.grids[level * kPlanes + plane];
-    const uint32_t a = static_cast<uint32_t>(i - grid.i0), b = static_cast<uint32_t>(j - grid.j0);
-    const bool inside = a < static_cast<uint32_t>(grid.n_i) && b < static_cast<uint32_t>(grid.n_j);
-    return inside ? field.directory[grid.first + static_cast<int32_t>(a) * grid.n_j + static_cast<int32_t>(b)]
-                  : -1;
-  }
-  const int32_t number = find_brick(level, plane, i, j, field.probe, field.capacity, field.brick_keys);
-  return number < 0 ? -1 : number * 2 + (field.masks[number] == -1);
-}
-
+// Directory entries of bricks: 2 x number + 1 if all vertices exist, -1 = absent.
 SNH_INLINE veci find_entries(const SimdField& field, int level, int plane, veci i, veci j) {
   if (field.directory) {
     const BrickGrid& grid = field.grids[level * kPlanes + plane];
@@ -56,7 +44,11 @@ SNH_INLINE veci find_entries(const SimdField& field, int level, int plane, veci 
   int32_t lane_i[W], lane_j[W];
   store(lane_i, i);
   store(lane_j, j);
-  for (int l = 0; l < W; ++l) lane_i[l] = find_entry(field, level, plane, lane_i[l], lane_j[l]);
+  for (int l = 0; l < W; ++l) {
+    const int32_t number =
+        find_brick(level, plane, lane_i[l], lane_j[l], field.probe, field.capacity, field.brick_keys);
+    lane_i[l] = number < 0 ? -1 : number * 2 + (field.masks[number] == -1);
+  }
   return load(lane_i);
 }
 
@@ -75,40 +67,24 @@ SNH_INLINE void touch(uint8_t* touched, veci number) {
 
 alignas(16) static const float kZeroRow[kFeatureRow] = {0, 0, 0, 0};
 
-// Points the odd lanes of a cell to copies of their rows. `low` and `high` are the entries of the bricks of (i, j) and
-// (i, j+1). Returns the lanes where not all four vertices exist.
-template <bool kValid>
-SNH_INLINE uint32_t copy_odd_cells(const SimdField& field, Lookup& lookup, uint32_t odd, int level, int plane,
-                                   veci i, veci j, veci low, veci high, int64_t at) {
-  int32_t lane_i[W], lane_j[W], lane_entry[2][W];
-  store(lane_i, i);
-  store(lane_j, j);
-  store(lane_entry[0], low);
-  store(lane_entry[1], high);
-  uint32_t missing = 0;
+// Points the odd lanes of a cell to copies of their rows.
+SNH_INLINE void copy_odd_cells(const SimdField& field, Lookup& lookup, uint32_t odd, const veci (&slot)[4],
+                               int64_t at) {
+  int32_t lane_slot[4][W];
+  for (int c = 0; c < 4; ++c) store(lane_slot[c], slot[c]);
   for (; odd; odd &= odd - 1) {
     const int l = __builtin_ctz(odd);
     OddCell& cell = lookup.odd[lookup.n_odd];
     float* rows = lookup.scratch + static_cast<int64_t>(lookup.n_odd++) * kOddFloats;
     cell.at = static_cast<int32_t>(at + l);
-    const bool cross_i = (lane_i[l] & (kBrickSide - 1)) == kBrickSide - 1;
     for (int c = 0; c < 4; ++c) {
-      const int32_t vi = lane_i[l] + (c & 1), vj = lane_j[l] + (c >> 1);
-      int32_t number = lane_entry[c >> 1][l] >> 1;
-      if ((c & 1) && cross_i) {
-        number = find_entry(field, level, plane, vi >> kBrickBits, vj >> kBrickBits) >> 1;
-        if (lookup.touched) lookup.touched[number] = 1;
-      }
-      const int32_t slot = cell.slot[c] = number * kBrickVertices + local_of(vi, vj);
-      store4(rows + c * kFeatureRow,
-             load4(slot < 0 ? kZeroRow : field.features + static_cast<int64_t>(slot) * kFeatureRow));
-      if (kValid && (slot < 0 || !((field.masks[number] >> (slot & (kBrickVertices - 1))) & 1)))
-        missing |= 1u << l;
+      const int32_t s = cell.slot[c] = lane_slot[c][l];
+      const float* row = field.features + static_cast<int64_t>(s) * kFeatureRow;
+      store4(rows + c * kFeatureRow, load4(s < 0 ? kZeroRow : row));
     }
     lookup.pair[at + l] = rows;
     lookup.pair[at + W + l] = rows + 2 * kFeatureRow;
   }
-  return missing;
 }
 
 // First stage for the W points of a group. kValid: returns the lanes where not all vertices exist.
@@ -129,31 +105,48 @@ SNH_INLINE uint32_t find_corners(const SimdField& field, Lookup& lookup, const v
     }
     for (int plane = 0; plane < kPlanes; ++plane, at += 2 * W) {
       const veci i = index[axis_u(plane)], j = index[axis_v(plane)];
-      const veci low = find_entries(field, level, plane, i >> kBrickBits, j >> kBrickBits);
-      veci high = low;  // of the pair at j+1
+      const veci brick_i = i >> kBrickBits, brick_j = j >> kBrickBits;
+      const veci local_i = i & side, local_j = (j & side) << kBrickBits,
+                 local_j1 = ((j + 1) & side) << kBrickBits;
       const veci cross_j = (j & side) == side;
       const bool any_cross_j = bits(cross_j) != 0;
-      if (any_cross_j)
-        high = cross_j ? find_entries(field, level, plane, i >> kBrickBits, (j >> kBrickBits) + 1) : low;
-
-      const veci slot = (low >> 1) * kBrickVertices + ((i & side) | ((j & side) << kBrickBits));
-      const veci high_slot = (high >> 1) * kBrickVertices + ((i & side) | (((j + 1) & side) << kBrickBits));
-      store_addresses(lookup.pair + at, field.features, slot);
-      store_addresses(lookup.pair + at + W, field.features, high_slot);
+      const veci low = find_entries(field, level, plane, brick_i, brick_j);  // of the pair at j
+      veci high = low;                                                       // of the pair at j+1
+      if (any_cross_j) high = find_entries(field, level, plane, brick_i, brick_j - cross_j);
+      veci slot[4] = {(low >> 1) * kBrickVertices + (local_i | local_j),
+                      {},
+                      (high >> 1) * kBrickVertices + (local_i | local_j1),
+                      {}};
+      store_addresses(lookup.pair + at, field.features, slot[0]);
+      store_addresses(lookup.pair + at + W, field.features, slot[2]);
       store(lookup.fraction + at, fraction[axis_u(plane)]);
       store(lookup.fraction + at + W, fraction[axis_v(plane)]);
-
-      const uint32_t odd = bits(((i & side) == side) | (low < 0) | (high < 0));
-      if (kValid && bits((low & high & 1) == 0) & ~odd) {
-        const veci exist = vertex_exists(field, slot) & vertex_exists(field, slot + 1) &
-                           vertex_exists(field, high_slot) & vertex_exists(field, high_slot + 1);
-        missing |= ~bits(exist) & ~odd;
-      }
       if (lookup.touched) {
         touch(lookup.touched, low >> 1);
         if (any_cross_j) touch(lookup.touched, high >> 1);
       }
-      if (odd) missing |= copy_odd_cells<kValid>(field, lookup, odd, level, plane, i, j, low, high, at);
+
+      const veci cross_i = local_i == side;
+      const uint32_t odd = bits(cross_i | (low < 0) | (high < 0));
+      if (odd) {
+        const veci low1 = find_entries(field, level, plane, brick_i - cross_i, brick_j);
+        veci high1 = low1;
+        if (any_cross_j) high1 = find_entries(field, level, plane, brick_i - cross_i, brick_j - cross_j);
+        const veci local_i1 = (i + 1) & side;
+        slot[1] = (low1 >> 1) * kBrickVertices + (local_i1 | local_j);
+        slot[3] = (high1 >> 1) * kBrickVertices + (local_i1 | local_j1);
+        if (lookup.touched) {
+          touch(lookup.touched, low1 >> 1);
+          if (any_cross_j) touch(lookup.touched, high1 >> 1);
+        }
+        copy_odd_cells(field, lookup, odd, slot, at);
+      }
+      if (kValid && (odd || bits((low & high & 1) == 0))) {
+        const veci ones = splat(1);
+        const veci right = odd ? slot[1] : slot[0] + ones, high_right = odd ? slot[3] : slot[2] + ones;
+        missing |= bits(~(vertex_exists(field, slot[0]) & vertex_exists(field, right) &
+                          vertex_exists(field, slot[2]) & vertex_exists(field, high_right)));
+      }
     }
   }
   return missing;
