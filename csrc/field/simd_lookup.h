@@ -166,18 +166,21 @@ template <bool kJacobian>
 SNH_INLINE void encode_points(const SimdField& field, const Lookup& lookup, int group, int64_t ld,
                               float* encoded, float* jacobian) {
   const vec8 slope_u{-1, -1, -1, -1, 1, 1, 1, 1};
-  const int64_t first = group * pairs_per_group(field);
-  for (int quad = 0; quad < W; quad += 4)
-    for (int level = 0; level < field.n_levels; ++level) {
-      const int64_t cells = first + level * kPlanes * 2 * W + quad;
+  const int n_levels = field.n_levels, n_features = field.n_features;
+  for (int quad = 0; quad < W; quad += 4) {
+    const float* const* pair = lookup.pair + group * pairs_per_group(field) + quad;
+    const float* fraction = lookup.fraction + group * pairs_per_group(field) + quad;
+    float* out = encoded + group * W + quad;
+    for (int level = 0; level < n_levels; ++level, pair += kPlanes * 2 * W, fraction += kPlanes * 2 * W) {
       vec4 value[4];
+#pragma GCC unroll 4
       for (int p = 0; p < 4; ++p) {
         vec8 sum{}, slope[3] = {};
         for (int plane = 0; plane < kPlanes; ++plane) {
-          const int64_t at = cells + plane * 2 * W + p;
-          const vec8 low = load8(lookup.pair[at]), along_v = load8(lookup.pair[at + W]) - low;
-          const vec8 weights = pair_weights(lookup.fraction[at]);
-          const vec8 between = low + lookup.fraction[at + W] * along_v;
+          const int at = plane * 2 * W + p;
+          const vec8 low = load8(pair[at]), along_v = load8(pair[at + W]) - low;
+          const vec8 weights = pair_weights(fraction[at]);
+          const vec8 between = low + fraction[at + W] * along_v;
           sum += weights * between;
           if (kJacobian) {
             slope[axis_u(plane)] += slope_u * between;
@@ -189,9 +192,9 @@ SNH_INLINE void encode_points(const SimdField& field, const Lookup& lookup, int 
           for (int a = 0; a < 3; ++a, jacobian += kFeatureRow) store4(jacobian, fold(slope[a]));
       }
       transpose4(value);
-      for (int f = 0; f < field.n_features; ++f)
-        store4(encoded + (level * field.n_features + f) * ld + group * W + quad, value[f]);
+      for (int f = 0; f < n_features; ++f, out += ld) store4(out, value[f]);
     }
+  }
 }
 
 // The gradient that belongs to a feature row.
@@ -207,25 +210,29 @@ template <bool kScatter>
 SNH_INLINE void points_backward(const SimdField& field, const Lookup& lookup, int group, int64_t ld,
                                 const float* grad_encoded, const float* jacobian, int64_t to_gradient,
                                 float* grad_x) {
-  const int64_t first = group * pairs_per_group(field);
+  const int n_levels = field.n_levels, n_features = field.n_features;
   for (int quad = 0; quad < W; quad += 4) {
+    const float* const* pair = lookup.pair + group * pairs_per_group(field) + quad;
+    const float* fraction = lookup.fraction + group * pairs_per_group(field) + quad;
     const int n = group * W + quad;
+    const float* from = grad_encoded + n;
     vec4 along[3][4] = {};
-    for (int level = 0; level < field.n_levels; ++level) {
+    for (int level = 0; level < n_levels; ++level, pair += kPlanes * 2 * W, fraction += kPlanes * 2 * W) {
+      const float inv_cell = field.inv_cell[level];
       vec4 grad[4] = {};
-      for (int f = 0; f < field.n_features; ++f)
-        grad[f] = load4(grad_encoded + (level * field.n_features + f) * ld + n);
+      for (int f = 0; f < n_features; ++f, from += ld) grad[f] = load4(from);
       transpose4(grad);
+#pragma GCC unroll 4
       for (int p = 0; p < 4; ++p) {
-        const vec4 per_metre = grad[p] * field.inv_cell[level];
+        const vec4 per_metre = grad[p] * inv_cell;
         for (int a = 0; a < 3; ++a, jacobian += kFeatureRow) along[a][p] += per_metre * load4(jacobian);
         if (!kScatter) continue;
         const vec8 grad2 = twice(grad[p]);
         for (int plane = 0; plane < kPlanes; ++plane) {
-          const int64_t at = first + (level * kPlanes + plane) * 2 * W + quad + p;
-          const vec8 both = grad2 * pair_weights(lookup.fraction[at]), high = lookup.fraction[at + W] * both;
-          add_pair(gradient_of(lookup.pair[at], to_gradient), both - high);
-          add_pair(gradient_of(lookup.pair[at + W], to_gradient), high);
+          const int at = plane * 2 * W + p;
+          const vec8 both = grad2 * pair_weights(fraction[at]), high = fraction[at + W] * both;
+          add_pair(gradient_of(pair[at], to_gradient), both - high);
+          add_pair(gradient_of(pair[at + W], to_gradient), high);
         }
       }
     }
