@@ -47,7 +47,7 @@ format: $(READY)
 # libraries must be the first that the interpreter loads. Leaks are not counted: Python keeps objects until it exits.
 asan: $(READY)
 	@echo "== sanitizers: the op tests with an instrumented build"
-	@SNH_SANITIZE=address,undefined SNH_BUILD=build/asan/native \
+	@SNH_CUDA=off SNH_SANITIZE=address,undefined SNH_BUILD=build/asan/native \
 	  $(BIN)/python setup.py --quiet build --build-base build/asan --build-lib build/asan/lib
 	@LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libstdc++.so.6)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 PYTHONPATH=build/asan/lib OMP_NUM_THREADS=1 \
@@ -59,7 +59,7 @@ build: $(VENV)/.requirements
 
 wheel: $(READY)
 	@rm -rf build/lib.*
-	@SNH_CUDA_ARCHITECTURES=all $(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
+	@SNH_BUILD=$(CURDIR)/build/wheel SNH_CUDA_ARCHITECTURES=all $(BIN)/pip wheel --quiet --no-build-isolation --no-deps --wheel-dir dist .
 	@ls dist/*.whl
 
 clean:

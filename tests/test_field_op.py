@@ -322,6 +322,38 @@ def test_fast_map_far_outside(far, impl):
     assert all(value.isfinite().all() for value in fine.values())
 
 
+def test_fast_map_follows_the_table(impl):
+    """The directory of bricks is kept between calls: other tables, growth and masks of the same bricks are noticed."""
+    rays = make_rays(20, N_BASE + N_SURFACE)
+    for missing in (0.02, 0.5, 0.02, 0.9):
+        assert_fast_map(make_scene(missing=missing), rays, impl)
+    scene = make_scene(missing=0.0)
+    half = Scene(scene.spec, HashTable(), scene.slots, scene.features.clone(), scene.decoder)
+    half.table.insert(
+        scene.table.brick_keys[::2].contiguous(), scene.table.masks[::2].contiguous() & 0x0F0F0F0F0F0F0F0F
+    )
+    for grow in (lambda: None, lambda: half.table.insert(scene.table.brick_keys, scene.table.masks)):
+        grow()
+        exists = (half.table.masks[:, None] >> torch.arange(64)) & 1
+        half.features = scene.features[: half.table.n_bricks * 64] * exists.reshape(-1, 1)
+        half.slots = dict(enumerate(torch.nonzero(exists.flatten()).flatten().tolist()))
+        assert_fast_map(half, rays, impl)
+
+
+def test_fast_map_with_bricks_far_apart(impl):
+    """Two rooms 100 km apart: no grid of bricks covers both, so the hash table itself is asked."""
+    scene, rays = make_scene(), make_rays(33, N_BASE + N_SURFACE)
+    near = scene.table.n_bricks
+    keys = torch.cat([scene.table.brick_keys, scene.table.brick_keys + (250_000 << 28) + 250_000])
+    scene.table.insert(keys.unique(), torch.full_like(keys, -1))
+    assert scene.table.n_bricks == 2 * near
+    masks = torch.cat([make_scene().table.masks, torch.full((near,), -1)])
+    scene.table = HashTable.from_bricks(scene.table.brick_keys.clone(), masks)
+    scene.features = torch.cat([scene.features, torch.ones_like(scene.features)])
+    scene.slots |= {("far", k): near * 64 + k for k in range(near * 64)}
+    assert_fast_map(scene, rays, impl)
+
+
 def test_fast_map_without_map(impl):
     rays = {k: v if k == "frame_index" else v.float() for k, v in make_rays(33, 9).items()}
     features, table, decoder, spec = empty_map(SPEC)

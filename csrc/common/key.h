@@ -54,17 +54,23 @@ SNH_HD inline uint32_t hash_brick(uint32_t head, int32_t brick_i, int32_t brick_
   return h ^ (h >> 13);
 }
 
-// Brick number of a brick, or -1. `capacity` is a power of two larger than the number of bricks; 0 = empty table.
-SNH_HD inline int32_t find_brick(int level, int plane, int32_t brick_i, int32_t brick_j, const int32_t* probe,
-                                 int64_t capacity, const int64_t* brick_keys) {
+// Brick number of a key whose hash_brick is `hash`, or -1. `capacity` is a power of two larger than the number of
+// bricks; 0 = empty table.
+SNH_HD inline int32_t find_key(int64_t key, uint32_t hash, const int32_t* probe, int64_t capacity,
+                               const int64_t* brick_keys) {
   if (capacity == 0) return -1;
-  const int64_t key = pack_key(level, plane, brick_i, brick_j);
-  uint32_t place = hash_brick(static_cast<uint32_t>(level * 4 + plane), brick_i, brick_j);
-  while (true) {
+  for (uint32_t place = hash;; ++place) {
     const int32_t number = probe[place & static_cast<uint32_t>(capacity - 1)];
     if (number < 0 || brick_keys[number] == key) return number;
-    ++place;
   }
+}
+
+// Brick number of a brick, or -1.
+SNH_HD inline int32_t find_brick(int level, int plane, int32_t brick_i, int32_t brick_j, const int32_t* probe,
+                                 int64_t capacity, const int64_t* brick_keys) {
+  return find_key(pack_key(level, plane, brick_i, brick_j),
+                  hash_brick(static_cast<uint32_t>(level * 4 + plane), brick_i, brick_j), probe, capacity,
+                  brick_keys);
 }
 
 // Slot of a vertex, or -1.

@@ -53,8 +53,76 @@ struct ShareMemory {
   std::vector<uint8_t> touched;
 };
 
+// The bricks of the hash table by place, so that W of them are found by one gather: the smallest grid around the bricks
+// of each level and plane. It follows the table's keys from call to call. Where bricks lie too far apart for grids
+// (kPlacesPerBrick), it stays empty and the hash table itself is asked.
+class Directory {
+ public:
+  void point(SimdField& field) {
+    if (!is_current(field)) rebuild(field);
+    field.directory = entries_.empty() ? nullptr : entries_.data();
+    std::copy(std::begin(grids_), std::end(grids_), field.grids);
+  }
+
+ private:
+  static constexpr int64_t kPlacesPerBrick = 16, kPlacesAlways = 1 << 16;
+
+  bool is_current(const SimdField& field) const {
+    const size_t n = static_cast<size_t>(field.n_bricks);
+    return keys_.size() == n && masks_.size() == n &&
+           std::equal(keys_.begin(), keys_.end(), field.brick_keys) &&
+           std::equal(masks_.begin(), masks_.end(), field.masks);
+  }
+
+  void rebuild(const SimdField& field) {
+    keys_.assign(field.brick_keys, field.brick_keys + field.n_bricks);
+    masks_.assign(field.masks, field.masks + field.n_bricks);
+    entries_.clear();
+    const int64_t n_places = lay_out_grids(field.n_levels);
+    if (n_places > kPlacesAlways + kPlacesPerBrick * field.n_bricks) return;
+    entries_.assign(static_cast<size_t>(n_places), -1);
+    for (int32_t number = 0; number < field.n_bricks; ++number) {
+      const Brick brick = unpack_key(keys_[number]);
+      if (brick.level >= field.n_levels || brick.plane >= kPlanes) continue;
+      const BrickGrid& grid = grids_[brick.level * kPlanes + brick.plane];
+      entries_[grid.first + (brick.i - grid.i0) * grid.n_j + (brick.j - grid.j0)] =
+          2 * number + (masks_[number] == -1);
+    }
+  }
+
+  // Returns how many places all grids have.
+  int64_t lay_out_grids(int n_levels) {
+    Brick low[kMaxLevels * kPlanes], high[kMaxLevels * kPlanes];
+    bool any[kMaxLevels * kPlanes] = {};
+    for (const int64_t key : keys_) {
+      const Brick brick = unpack_key(key);
+      if (brick.level >= n_levels || brick.plane >= kPlanes) continue;
+      const int k = brick.level * kPlanes + brick.plane;
+      if (!any[k]) low[k] = high[k] = brick;
+      any[k] = true;
+      low[k] = {0, 0, std::min(low[k].i, brick.i), std::min(low[k].j, brick.j)};
+      high[k] = {0, 0, std::max(high[k].i, brick.i), std::max(high[k].j, brick.j)};
+    }
+    int64_t n_places = 1;
+    for (int k = 0; k < kMaxLevels * kPlanes; ++k) {
+      grids_[k] = {};
+      if (!any[k]) continue;
+      const int64_t n_i = int64_t(high[k].i) - low[k].i + 1, n_j = int64_t(high[k].j) - low[k].j + 1;
+      grids_[k] = {low[k].i, low[k].j, static_cast<int32_t>(n_i), static_cast<int32_t>(n_j),
+                   static_cast<int32_t>(n_places)};
+      n_places += n_i * n_j;
+    }
+    return n_places;
+  }
+
+  std::vector<int64_t> keys_, masks_;
+  std::vector<int32_t> entries_;
+  BrickGrid grids_[kMaxLevels * kPlanes] = {};
+};
+
 struct Memory {
   Buffer panels;
+  Directory directory;
   std::vector<ShareMemory> shares;
 };
 
@@ -105,7 +173,7 @@ int64_t mlp_panel_floats(int n_in, int hidden, int n_out) {
   return layer(n_in, hidden) + layer(hidden, hidden) + layer(hidden, n_out);
 }
 
-SimdField pack(const FieldSpec& spec, const FieldModel<float>& model, Buffer& panels) {
+SimdField pack(const FieldSpec& spec, const FieldModel<float>& model, Memory& memory) {
   SimdField field{};
   field.n_levels = spec.n_levels;
   field.n_features = spec.n_features;
@@ -122,10 +190,11 @@ SimdField pack(const FieldSpec& spec, const FieldModel<float>& model, Buffer& pa
   field.masks = model.masks;
   field.n_bricks = model.n_bricks;
   field.features = model.features;
+  memory.directory.point(field);
 
   const int n_color = spec.n_gamma() + spec.n_geometry;
-  float* next = panels.floats(mlp_panel_floats(spec.n_encoding(), spec.hidden, 1 + spec.n_geometry) +
-                              mlp_panel_floats(n_color, spec.hidden, 3));
+  float* next = memory.panels.floats(mlp_panel_floats(spec.n_encoding(), spec.hidden, 1 + spec.n_geometry) +
+                                     mlp_panel_floats(n_color, spec.hidden, 3));
   const float* flat = model.decoder;
   field.geometry = pack_mlp(flat, spec.n_encoding(), spec.hidden, 1 + spec.n_geometry, next);
   field.color = pack_mlp(flat, n_color, spec.hidden, 3, next);
@@ -166,30 +235,29 @@ void add_and_clear(float* to, float* from, int64_t n) {
   }
 }
 
-// Brick b of all shares into the first, which works on the caller's tensor, in ascending order. A brick that was only
-// perhaps touched (its neighbour was) counts if a gradient arrived; rows of absent vertices are dropped.
-void reduce_brick(const std::vector<SimdMapShare>& shares, const int64_t* masks, int64_t b) {
-  uint8_t flags = shares[0].touched[b];
+// Brick b of all shares into the first, which works on the caller's tensor, in ascending order; rows of absent vertices
+// are dropped.
+void reduce_brick(std::vector<SimdMapShare>& shares, const int64_t* masks, int64_t b, uint8_t* touched) {
   float* brick = shares[0].grad_features + b * kBrickFloats;
-  for (size_t k = 1; k < shares.size(); ++k) {
-    if (!shares[k].touched[b]) continue;
-    flags |= shares[k].touched[b];
-    shares[k].touched[b] = 0;
-    add_and_clear(brick, shares[k].grad_features + b * kBrickFloats, kBrickFloats);
+  bool any = false;
+  for (size_t k = 0; k < shares.size(); ++k) {
+    uint8_t& own = shares[k].touched[b + 1];
+    if (own && k > 0) add_and_clear(brick, shares[k].grad_features + b * kBrickFloats, kBrickFloats);
+    any |= own != 0;
+    own = 0;
   }
-  if (!flags) return;
-  if (masks[b] != -1)
-    for (int local = 0; local < kBrickVertices; ++local)
-      if (!((masks[b] >> local) & 1)) std::fill_n(brick + local * kFeatureStride, kFeatureStride, 0.f);
-  shares[0].touched[b] =
-      (flags & 1) || std::any_of(brick, brick + kBrickFloats, [](float g) { return g != 0; });
+  if (!any) return;
+  touched[b] = 1;
+  for (int local = 0; masks[b] != -1 && local < kBrickVertices; ++local)
+    if (!((masks[b] >> local) & 1)) std::fill_n(brick + local * kFeatureStride, kFeatureStride, 0.f);
 }
 
 void reduce(const SimdSet& set, const SimdField& field, std::vector<SimdMapShare>& shares, int64_t n_frames,
             const FieldGradients<float>& gradients, int64_t decoder_size, const ParallelFor& parallel_for) {
   for_each_share(field.n_bricks, static_cast<int>(shares.size()), parallel_for,
                  [&](size_t, int64_t begin, int64_t end) {
-                   for (int64_t b = begin; b < end; ++b) reduce_brick(shares, field.masks, b);
+                   for (int64_t b = begin; b < end; ++b)
+                     reduce_brick(shares, field.masks, b, gradients.touched);
                  });
   std::fill_n(gradients.decoder, decoder_size, 0.f);
   std::fill_n(gradients.T_wc, n_frames * 12, 0.f);
@@ -215,7 +283,7 @@ void field_map(const std::string& name, const FieldSpec& spec, const FieldModel<
                const ParallelFor& parallel_for) {
   const SimdSet& set = *find_set(name);
   Memory& memory = memory_of_this_thread();
-  const SimdField field = pack(spec, model, memory.panels);
+  const SimdField field = pack(spec, model, memory);
   SimdMap map{plain(rays),
               sampling.n_base,
               sampling.n_surface,
@@ -234,9 +302,9 @@ void field_map(const std::string& name, const FieldSpec& spec, const FieldModel<
     ShareMemory& own = memory.shares[k];
     shares[k].workspace = own.workspace.floats(0);
     if (!map.with_gradients) continue;
-    own.touched.resize(std::max<size_t>(own.touched.size(), field.n_bricks));
+    own.touched.resize(std::max<size_t>(own.touched.size(), 1 + field.n_bricks));
     shares[k].grad_features = k ? own.features.floats(field.n_bricks * kBrickFloats) : gradients.features;
-    shares[k].touched = k ? own.touched.data() : gradients.touched;
+    shares[k].touched = own.touched.data();
     shares[k].grad_T_wc = own.T_wc.floats(rays.n_frames * 12);
     shares[k].weight_tiles = own.weight_tiles.floats(set.weight_tile_floats(field));
   }
@@ -259,7 +327,7 @@ void field_track(const std::string& name, const FieldSpec& spec, const FieldMode
                  bool* valid, int n_threads, const ParallelFor& parallel_for) {
   const SimdSet& set = *find_set(name);
   Memory& memory = memory_of_this_thread();
-  const SimdField field = pack(spec, model, memory.panels);
+  const SimdField field = pack(spec, model, memory);
   const SimdTrack track{plain(rays), n_samples, band, residuals, jacobian, valid};
   const int n_shares = prepare_shares(memory, set, field, n_samples, rays.n_rays, n_threads);
   for_each_share(rays.n_rays, n_shares, parallel_for, [&](size_t k, int64_t begin, int64_t end) {
@@ -272,7 +340,7 @@ void field_query(const std::string& name, const FieldSpec& spec, const FieldMode
                  const ParallelFor& parallel_for) {
   const SimdSet& set = *find_set(name);
   Memory& memory = memory_of_this_thread();
-  const SimdField field = pack(spec, model, memory.panels);
+  const SimdField field = pack(spec, model, memory);
   const int n_shares = prepare_shares(memory, set, field, 1, n_points, n_threads);
   for_each_share(n_points, n_shares, parallel_for, [&](size_t k, int64_t begin, int64_t end) {
     set.query_points(field, points, begin, end, tsdf, color, valid, memory.shares[k].workspace.floats(0));

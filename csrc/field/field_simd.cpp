@@ -29,11 +29,12 @@ struct Block {
   float* grad_weight;                   // dL/dp
   float* grad_x;                        // [3]
   float* jacobian;                      // [L * kJacobianFloats]
+  float *color_x, *color_grad_x;        // [3] of the active samples, dense
   float* base_z;                        // [2 S] strata before merging
-  int32_t* complete;                    // per vector: all bricks of its look-ups exist
   int32_t* active;                      // columns of the samples whose colour is decoded
   int32_t* active_end;                  // per ray: end of its run in `active`
-  LookupRows lookup;
+  bool* valid;                          // all vertices of the look-up exist
+  Lookup lookup;
   MlpRows geometry, color;  // color: the active samples only, dense
 
   float* tsdf() const { return geometry.output; }
@@ -82,14 +83,19 @@ Block carve(Carver& carver, const SimdField& field, int n_samples) {
   block.near_surface = rows(1);
   block.grad_weight = rows(1);
   block.grad_x = rows(3);
+  block.color_x = rows(3);
+  block.color_grad_x = rows(3);
   block.jacobian = rows(field.n_levels * kJacobianFloats);
   block.base_z = carver.floats(2 * n_samples);
-  block.complete = carver.ints(ld / W);
+  block.valid = reinterpret_cast<bool*>(carver.ints(ld));
   block.active = carver.ints(ld);
   block.active_end = carver.ints(n_rays);
-  block.lookup.place = carver.ints(n_cells * 4 * ld);
-  block.lookup.fraction = rows(n_cells * 2);
-  block.lookup.cache = reinterpret_cast<BrickQuad*>(carver.floats(kCacheFloats));
+  const int64_t n_pairs = ld * n_cells * 2;
+  block.lookup.pair =
+      reinterpret_cast<const float**>(carver.floats(n_pairs * sizeof(float*) / sizeof(float)));
+  block.lookup.fraction = carver.floats(n_pairs);
+  block.lookup.scratch = carver.floats(n_pairs / 2 * kOddFloats);
+  block.lookup.odd = reinterpret_cast<OddCell*>(carver.floats(n_pairs / 2 * sizeof(OddCell) / sizeof(float)));
   block.geometry = carve_mlp(carver, field.geometry, ld);
   block.color = carve_mlp(carver, field.color, ld);
   return block;
@@ -104,8 +110,7 @@ int64_t workspace_floats(const SimdField& field, int n_samples) {
 Block start(const SimdField& field, int n_samples, float* workspace, uint8_t* touched) {
   Carver carver{workspace};
   Block block = carve(carver, field, n_samples);
-  block.lookup.touched = touched;
-  clear(block.lookup.cache);
+  block.lookup.touched = touched ? touched + 1 : nullptr;
   return block;
 }
 
@@ -158,86 +163,79 @@ void pad_points(Block& block, int n_points) {
 
 // --- the field at the points of a block (eq. 4 and 5) -------------------------------------------------------------
 
-SNH_INLINE void positional_encoding(const SimdField& field, const Block& block, int n) {
+// Rows of gamma for the W points at column n of x [3].
+SNH_INLINE void positional_encoding(const SimdField& field, const float* x, float* gamma, int n, int64_t ld) {
   for (int a = 0; a < 3; ++a) {
-    const vec cycles = load(block.x + a * block.ld + n) * field.inv_wavelength;
+    const vec cycles = load(x + a * ld + n) * field.inv_wavelength;
     vec s, c;
     sincos_pi(cycles - round(cycles), s, c);
-    float* row = block.geometry.input + a * block.ld + n;
-    for (int octave = 0; octave < field.n_octaves; ++octave, row += 6 * block.ld) {  // each doubles the angle
-      const vec twice = s + s;
-      s = twice * c;
+    float* row = gamma + a * ld + n;
+    for (int octave = 0; octave < field.n_octaves; ++octave, row += 6 * ld) {  // each doubles the angle
+      const vec twice_s = s + s;
+      s = twice_s * c;
       c = c * c * 2.f - 1.f;
       store(row, s);
-      store(row + 3 * block.ld, c);
+      store(row + 3 * ld, c);
     }
   }
 }
 
-// Adds to grad_x: d sin = k cos dx, d cos = -k sin dx.
-SNH_INLINE void positional_backward(const SimdField& field, const Block& block, int n) {
+// d sin = k cos dx, d cos = -k sin dx: adds to grad_x [3].
+SNH_INLINE void positional_backward(const SimdField& field, const float* gamma, const float* grad_gamma,
+                                    float* grad_x, int n, int64_t ld) {
   for (int a = 0; a < 3; ++a) {
-    float* grad_x = block.grad_x + a * block.ld + n;
-    const float* row = block.geometry.input + a * block.ld + n;
-    const float* grad = block.geometry.grad_input + a * block.ld + n;
-    vec sum{};
+    const float *row = gamma + a * ld + n, *grad = grad_gamma + a * ld + n;
+    vec total = load(grad_x + a * ld + n);
     float wave_number = 2 * 3.14159265f * field.inv_wavelength;
-    for (int octave = 0; octave < field.n_octaves; ++octave, wave_number *= 2) {
-      const int64_t sine = 6 * octave * block.ld, cosine = sine + 3 * block.ld;
-      sum += wave_number * (load(grad + sine) * load(row + cosine) - load(grad + cosine) * load(row + sine));
-    }
-    store(grad_x, load(grad_x) + sum);
+    for (int octave = 0; octave < field.n_octaves; ++octave, wave_number *= 2, row += 6 * ld, grad += 6 * ld)
+      total += wave_number * (load(grad) * load(row + 3 * ld) - load(grad + 3 * ld) * load(row));
+    store(grad_x + a * ld + n, total);
   }
 }
 
 template <bool kJacobian, bool kValid>
-void encode(const SimdField& field, const Block& block, int32_t* valid) {
-  const int64_t ld = block.ld;
+void encode(const SimdField& field, Block& block, bool* valid) {
+  const int64_t ld = block.ld, jacobian_floats = static_cast<int64_t>(field.n_levels) * kJacobianFloats;
   float* encoded = block.geometry.input + 6 * field.n_octaves * ld;
+  block.lookup.n_odd = 0;
   for (int n = 0; n < block.n_padded; n += W) {
     const vec x[3] = {load(block.x + n), load(block.x + ld + n), load(block.x + 2 * ld + n)};
-    float* jacobian = block.jacobian + static_cast<int64_t>(n) * field.n_levels * kJacobianFloats;
-    veci exists;
-    const bool complete = find_corners<kValid>(field, block.lookup, x, n, ld, exists);
-    block.complete[n / W] = complete;
-    if (complete)
-      encode_points<true, kJacobian>(field, block.lookup, n, ld, encoded, jacobian);
-    else
-      encode_points<false, kJacobian>(field, block.lookup, n, ld, encoded, jacobian);
-    if (kValid) store(valid + n, exists);
-    positional_encoding(field, block, n);
+    const uint32_t missing = find_corners<kValid>(field, block.lookup, x, n / W);
+    for (int l = 0; kValid && l < W; ++l) valid[n + l] = !((missing >> l) & 1);
+    encode_points<kJacobian>(field, block.lookup, n / W, ld, encoded, block.jacobian + n * jacobian_floats);
+    positional_encoding(field, block.x, block.geometry.input, n, ld);
   }
 }
 
 // From geometry.grad_input to grad_x and, if kScatter, to the features.
 template <bool kScatter>
 void encode_backward(const SimdField& field, const Block& block, float* grad_features) {
-  const int64_t ld = block.ld;
+  const int64_t ld = block.ld, jacobian_floats = static_cast<int64_t>(field.n_levels) * kJacobianFloats;
   const float* grad_encoded = block.geometry.grad_input + 6 * field.n_octaves * ld;
+  const int64_t to_gradient =
+      reinterpret_cast<intptr_t>(grad_features) - reinterpret_cast<intptr_t>(field.features);
+  if (kScatter) prepare_odd_cells(block.lookup, to_gradient);
   for (int n = 0; n < block.n_padded; n += W) {
-    const float* jacobian = block.jacobian + static_cast<int64_t>(n) * field.n_levels * kJacobianFloats;
-    if (block.complete[n / W])
-      points_backward<true, kScatter>(field, block.lookup, n, ld, grad_encoded, jacobian, grad_features,
-                                      block.grad_x);
-    else
-      points_backward<false, kScatter>(field, block.lookup, n, ld, grad_encoded, jacobian, grad_features,
-                                       block.grad_x);
-    positional_backward(field, block, n);
+    points_backward<kScatter>(field, block.lookup, n / W, ld, grad_encoded,
+                              block.jacobian + n * jacobian_floats, to_gradient, block.grad_x);
+    positional_backward(field, block.geometry.input, block.geometry.grad_input, block.grad_x, n, ld);
   }
+  if (kScatter) add_odd_cells(block.lookup, grad_features);
 }
 
-// Copies gamma and rho of n columns to the dense input of the colour decoder, padded with zeros, and decodes;
-// color.output becomes the colour.
+// Decodes the colour of n columns, dense in color.output. Their points and rho are copied, padded with zeros, and
+// gamma is computed again: cheaper than copying its many rows.
 void decode_color(const SimdField& field, const Block& block, const int32_t* columns, int n) {
   const int64_t ld = block.ld;
-  const int n_gamma = 6 * field.n_octaves, n_padded = round_up(n, W);
-  for (int row = 0; row < n_gamma + field.n_geometry; ++row) {
-    const float* from =
-        row < n_gamma ? block.geometry.input + row * ld : block.geometry.output + (row - n_gamma + 1) * ld;
-    float* to = block.color.input + row * ld;
+  const int n_padded = round_up(n, W);
+  const auto copy = [&](const float* from, float* to) {
     for (int k = 0; k < n; ++k) to[k] = from[columns[k]];
     for (int k = n; k < n_padded; ++k) to[k] = 0;
-  }
+  };
+  for (int a = 0; a < 3; ++a) copy(block.x + a * ld, block.color_x + a * ld);
+  float* rho = block.color.input + 6 * field.n_octaves * ld;
+  for (int g = 0; g < field.n_geometry; ++g) copy(block.geometry.output + (1 + g) * ld, rho + g * ld);
+  for (int k = 0; k < n_padded; k += W) positional_encoding(field, block.color_x, block.color.input, k, ld);
   mlp_forward(field.color, block.color, n_padded, ld);
   for (int channel = 0; channel < 3; ++channel)
     for (int k = 0; k < n_padded; k += W) {
@@ -389,31 +387,32 @@ void find_active(const Block& block, int n_rays, int n_samples) {
   }
 }
 
-// Gradients of the colour decoder, and from it to rho (geometry.grad_output) and gamma (added to geometry.grad_input
-// by add_color_gradient once that exists).
+// From the gradients of the active colours to the colour decoder, to rho (geometry.grad_output) and to the points of the
+// active samples (color_grad_x).
 void color_backward(const SimdField& field, const Block& block, int n_active, float* weight_tiles) {
   const int64_t ld = block.ld;
-  const int n_padded = round_up(n_active, W);
-  for (int row = 0; row < round_up(3, kTileOutputs); ++row)
+  const int n_gamma = 6 * field.n_octaves, n_padded = round_up(n_active, W);
+  for (int row = 0; row < kTileOutputs; ++row)
     for (int k = row < 3 ? n_active : 0; k < n_padded; ++k) block.color.grad_output[row * ld + k] = 0;
   mlp_backward(field.color, block.color, 3, n_padded, ld);
   mlp_weight_gradients(field.color, block.color, weight_tiles, n_padded, ld);
-  for (int row = 0; row < round_up(1 + field.n_geometry, kTileOutputs); ++row) {
+
+  for (int row = 1; row < round_up(1 + field.n_geometry, kTileOutputs); ++row) {
     float* grad = block.geometry.grad_output + row * ld;
-    if (row == 0) continue;
     for (int n = 0; n < block.n_padded; n += W) store(grad + n, vec{});
-    if (row > field.n_geometry) continue;
-    const float* from = block.color.grad_input + (6 * field.n_octaves + row - 1) * ld;
-    for (int k = 0; k < n_active; ++k) grad[block.active[k]] = from[k];
+    const float* from = block.color.grad_input + (n_gamma + row - 1) * ld;
+    for (int k = 0; k < n_active && row <= field.n_geometry; ++k) grad[block.active[k]] = from[k];
+  }
+  for (int k = 0; k < n_padded; k += W) {
+    for (int a = 0; a < 3; ++a) store(block.color_grad_x + a * ld + k, vec{});
+    positional_backward(field, block.color.input, block.color.grad_input, block.color_grad_x, k, ld);
   }
 }
 
-void add_gamma_gradient(const SimdField& field, const Block& block, int n_active) {
-  for (int row = 0; row < 6 * field.n_octaves; ++row) {
-    const float* from = block.color.grad_input + row * block.ld;
-    float* to = block.geometry.grad_input + row * block.ld;
-    for (int k = 0; k < n_active; ++k) to[block.active[k]] += from[k];
-  }
+void add_color_gradient(const Block& block, int n_active) {
+  for (int a = 0; a < 3; ++a)
+    for (int k = 0; k < n_active; ++k)
+      block.grad_x[a * block.ld + block.active[k]] += block.color_grad_x[a * block.ld + k];
 }
 
 // p_w = R (z dir_c) + t.
@@ -459,8 +458,8 @@ void map_block(const SimdField& field, const SimdMap& map, SimdMapShare& share, 
   color_backward(field, block, n_active, share.weight_tiles + mlp_tile_floats(field.geometry));
   mlp_backward(field.geometry, block.geometry, 1 + field.n_geometry, block.n_padded, block.ld);
   mlp_weight_gradients(field.geometry, block.geometry, share.weight_tiles, block.n_padded, block.ld);
-  add_gamma_gradient(field, block, n_active);
   encode_backward<true>(field, block, share.grad_features);
+  add_color_gradient(block, n_active);
   pose_gradients(map, block, first_ray, n_rays, share.grad_T_wc);
 }
 
@@ -486,11 +485,11 @@ void add_weight_tiles(const SimdField& field, float* weight_tiles, float* grad_d
 // --- the track form -----------------------------------------------------------------------------------------------
 
 // Residuals, Jacobian and validity of one ray, from tsdf and its gradient in grad_x.
-void write_track(const SimdField& field, const SimdTrack& track, const Block& block, const int32_t* valid,
-                 const Ray& ray, int first, int64_t out) {
+void write_track(const SimdField& field, const SimdTrack& track, const Block& block, const Ray& ray,
+                 int first, int64_t out) {
   for (int n = first; n < first + track.n_samples; ++n, ++out) {
     track.residuals[out] = field.truncation * block.tsdf()[n] - block.ahead[n];
-    track.valid[out] = valid[n] != 0;
+    track.valid[out] = block.valid[n];
     float h[3], p[3];  // T_r R^T ds/dp_w and the point, camera frame
     for (int a = 0; a < 3; ++a) {
       h[a] = 0;
@@ -516,14 +515,13 @@ void track_block(const SimdField& field, const SimdTrack& track, Block& block, i
     place_points(block, ray, r * S, S);
   }
   pad_points(block, n_rays * S);
-  int32_t* valid = block.active;
-  encode<true, true>(field, block, valid);
+  encode<true, true>(field, block, block.valid);
   mlp_forward(field.geometry, block.geometry, block.n_padded, block.ld);
   for (int n = 0; n < block.n_padded; n += W) store(block.grad_tsdf() + n, splat(1.f));
   mlp_backward(field.geometry, block.geometry, 1, block.n_padded, block.ld);
   encode_backward<false>(field, block, nullptr);
   for (int r = 0; r < n_rays; ++r)
-    write_track(field, track, block, valid, ray_at(track.rays, first_ray + r), r * S, (first_ray + r) * S);
+    write_track(field, track, block, ray_at(track.rays, first_ray + r), r * S, (first_ray + r) * S);
 }
 
 void track_rays(const SimdField& field, const SimdTrack& track, int64_t begin, int64_t end,
@@ -543,12 +541,11 @@ void query_block(const SimdField& field, Block& block, const float* points, int 
     block.active[k] = k;
   }
   pad_points(block, n);
-  int32_t* exists = reinterpret_cast<int32_t*>(block.weight);
-  encode<false, true>(field, block, exists);
+  encode<false, true>(field, block, block.valid);
   mlp_forward(field.geometry, block.geometry, block.n_padded, block.ld);
   for (int k = 0; k < n; ++k) {
     tsdf[k] = block.tsdf()[k];
-    valid[k] = exists[k] != 0;
+    valid[k] = block.valid[k];
   }
   if (!color) return;
   decode_color(field, block, block.active, n);

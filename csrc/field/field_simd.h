@@ -8,7 +8,8 @@
 
 namespace snh {
 
-constexpr int kPanel = 8;  // outputs that one register tile of a layer computes
+constexpr int kPanel = 8;       // outputs that one register tile of a layer computes
+constexpr int kFeatureRow = 4;  // floats
 
 constexpr int round_up(int n, int multiple) { return (n + multiple - 1) / multiple * multiple; }
 
@@ -23,6 +24,12 @@ struct SimdMlp {
   SimdLayer layer[3];
 };
 
+// Where the bricks of one level and plane lie in the directory: brick (i, j) at first + (i - i0) * n_j + (j - j0), for
+// i - i0 in [0, n_i) and j - j0 in [0, n_j). Place 0 of the directory is an absent brick.
+struct BrickGrid {
+  int32_t i0, j0, n_i, n_j, first;
+};
+
 // The model and the spec, as one call sees them.
 struct SimdField {
   int n_levels, n_features, n_octaves, hidden, n_geometry;
@@ -32,6 +39,9 @@ struct SimdField {
   int64_t capacity;
   const int64_t *brick_keys, *masks;
   int64_t n_bricks;
+  const int32_t*
+      directory;  // 2 x number + 1 if the brick has all its vertices, or -1; null: ask the hash table
+  BrickGrid grids[kMaxLevels * kPlanes];
   const float* features;
   SimdMlp geometry, color;
 };
@@ -47,7 +57,7 @@ struct SimdMapShare {
   int64_t begin, end;  // rays
   double losses[4];    // sums over its rays
   float* grad_features;
-  uint8_t* touched;
+  uint8_t* touched;     // [1 + B]; the first is for absent bricks
   float* grad_T_wc;     // [M, 3, 4]
   float* weight_tiles;  // gradient of the decoder in the order of the register tiles
   float* workspace;

@@ -1,5 +1,9 @@
-// Look-up in the planes (eq. 4), in two stages. Vectors of W points find cells, fractions and the places of their
-// corners; then point by point the rows, 16 bytes each, are read (or, backward, added to).
+// Look-up in the planes (eq. 4), in two stages. First, W points at a time, cells, fractions and the addresses of the
+// corners; then, point by point, the feature rows are read (or, backward, added to).
+//
+// Two corners (i, j) and (i+1, j) of a cell are neighbours in their brick, so a cell is two loads of two rows: a pair at
+// j and a pair at j+1. Where i+1 lies in the next brick, or a brick is absent, the cell is `odd`: its four rows are
+// copied to a scratch place and read from there; backward, the scratch place collects and is added at the end.
 #pragma once
 
 #include "common/key.h"
@@ -8,226 +12,256 @@
 
 namespace snh::SNH_SIMD {
 
-// Consecutive samples of a ray share bricks, and neighbouring rays do. The hash table is asked once per brick and
-// call for the four bricks that the corners of its cells can lie in; this direct-mapped cache remembers.
-struct BrickQuad {
-  int64_t key;        // of the first brick; -1 = empty entry
-  int32_t number[4];  // bricks (i, j), (i+1, j), (i, j+1), (i+1, j+1); -1 = absent
-  int32_t full;       // all four exist with all their vertices
-  int32_t padding;
+// A cell whose four rows do not lie in two pairs.
+struct OddCell {
+  int32_t at;       // its first address in `pair`
+  int32_t slot[4];  // (i, j), (i+1, j), (i, j+1), (i+1, j+1); negative = absent
 };
-constexpr int kCacheEntries = 2048;  // 64 kB
-constexpr int64_t kCacheFloats = kCacheEntries * sizeof(BrickQuad) / sizeof(float);
+constexpr int kOddFloats = 4 * kFeatureRow;
 
-// Values of `touched`: the first brick of a quad gets a gradient, the others perhaps.
-constexpr uint8_t kTouched = 1, kPerhapsTouched = 2;
+// What the first stage leaves for a block. Groups of W points; cell = level * 3 + plane.
+struct Lookup {
+  const float** pair;  // [group][cell][2][W] rows (i, j) and (i+1, j); the same at j+1
+  float* fraction;     // [group][cell][2][W] u and v within the cell, in cells
+  OddCell* odd;
+  float* scratch;  // [odd cell][4 rows]
+  int n_odd;
+  uint8_t* touched;  // [B]: set to 1 for bricks that get a gradient, also at -1; null: none wanted
+};
 
-inline void clear(BrickQuad* cache) {
-  for (int k = 0; k < kCacheEntries; ++k) cache[k].key = -1;
+SNH_INLINE int64_t pairs_per_group(const SimdField& field) {
+  return static_cast<int64_t>(field.n_levels) * kPlanes * 2 * W;
 }
 
-inline __attribute__((noinline)) void fill(BrickQuad& quad, const SimdField& field, int64_t key,
-                                           uint8_t* touched) {
-  const Brick brick = unpack_key(key);
-  quad.key = key;
-  quad.full = 1;
-  for (int c = 0; c < 4; ++c) {
-    const int32_t number = find_brick(brick.level, brick.plane, brick.i + (c & 1), brick.j + (c >> 1),
-                                      field.probe, field.capacity, field.brick_keys);
-    quad.number[c] = number;
-    quad.full &= number >= 0 && field.masks[number] == -1;
-    if (touched && number >= 0) touched[number] |= c == 0 ? kTouched : kPerhapsTouched;
+// Directory entries of bricks: 2 x number + 1 if all vertices exist, -1 = absent.
+SNH_INLINE veci find_entries(const SimdField& field, int level, int plane, veci i, veci j) {
+  if (field.directory) {
+    const BrickGrid& grid = field.grids[level * kPlanes + plane];
+    const veci a = i - grid.i0, b = j - grid.j0;
+    const veci inside = (a >= 0) & (a < grid.n_i) & (b >= 0) & (b < grid.n_j);
+    return gather(field.directory, inside & (grid.first + a * grid.n_j + b));
   }
-}
-
-SNH_INLINE const BrickQuad& find_quad(BrickQuad* cache, const SimdField& field, uint32_t hash, int64_t key,
-                                      uint8_t* touched) {
-  BrickQuad& quad = cache[hash & (kCacheEntries - 1)];
-  if (__builtin_expect(quad.key != key, 0)) fill(quad, field, key, touched);
-  return quad;
-}
-
-// What the first stage leaves for a block, [.][ld]; cell = level * 3 + plane.
-struct LookupRows {
-  int32_t*
-      place;  // [cell * 4 + corner]: 2 * slot (rows are 2 * 8 bytes), negative = absent; corner = di + 2 dj
-  float* fraction;  // [cell * 2 + axis] within the cell
-  BrickQuad* cache;
-  uint8_t* touched;  // null: no gradients wanted
-};
-
-// hash_brick of a vector of bricks.
-SNH_INLINE vecu hash_bricks(uint32_t head, veci i, veci j) {
-  vecu h = (reinterpret_cast<vecu>(i) * 0x9E3779B1u) ^ (reinterpret_cast<vecu>(j) * 0x85EBCA77u) ^
-           (head * 0xC2B2AE3Du);
-  h ^= h >> 15;
-  h *= 0x2C1B3C6Du;
-  return h ^ (h >> 13);
-}
-
-// Numbers of the four bricks around each lane's brick (i, j); false if some of them lack vertices.
-SNH_INLINE bool find_quads(const SimdField& field, const LookupRows& rows, int level, int plane, veci i,
-                           veci j, veci (&number)[4]) {
-  const vecu hash = hash_bricks(static_cast<uint32_t>(level * 4 + plane), i, j);
-  int32_t lane_i[W], lane_j[W], lane_hash[W];
+  int32_t lane_i[W], lane_j[W];
   store(lane_i, i);
   store(lane_j, j);
-  store(lane_hash, reinterpret_cast<veci>(hash));
-  uint32_t first_of_run = bits((i != from_lane_before(i)) | (j != from_lane_before(j))) | 1;
-  bool full = true;
-  for (veci& one : number) one = veci{};
-  while (first_of_run) {
-    const int l = __builtin_ctz(first_of_run);
-    first_of_run &= first_of_run - 1;
-    const BrickQuad& quad = find_quad(rows.cache, field, static_cast<uint32_t>(lane_hash[l]),
-                                      pack_key(level, plane, lane_i[l], lane_j[l]), rows.touched);
-    const veci from_here = lanes() >= l;
-    for (int c = 0; c < 4; ++c) number[c] = from_here ? splat(quad.number[c]) : number[c];
-    full &= quad.full != 0;
+  for (int l = 0; l < W; ++l) {
+    const int32_t number =
+        find_brick(level, plane, lane_i[l], lane_j[l], field.probe, field.capacity, field.brick_keys);
+    lane_i[l] = number < 0 ? -1 : number * 2 + (field.masks[number] == -1);
   }
-  return full;
+  return load(lane_i);
 }
 
-// Whether vertex `local` of brick `number` exists, by lane.
-SNH_INLINE veci vertex_exists(const SimdField& field, veci number, veci local) {
+// Whether vertex `slot` exists, by lane; a negative one does not.
+SNH_INLINE veci vertex_exists(const SimdField& field, veci slot) {
   if (field.n_bricks == 0) return veci{};
-  const veci safe = number < 0 ? veci{} : number;
-  const veci word = gather(reinterpret_cast<const int32_t*>(field.masks), safe * 2 + (local >> 5));
-  return (number >= 0) & (((word >> (local & 31)) & 1) != 0);
+  const veci word = gather(reinterpret_cast<const int32_t*>(field.masks), (slot < 0 ? veci{} : slot) >> 5);
+  return (slot >= 0) & (((word >> (slot & 31)) & 1) != 0);
 }
 
-// First stage for W points at column n. Returns whether all bricks exist; `exists` (if kValid) whether all vertices do.
+SNH_INLINE void touch(uint8_t* touched, veci number) {
+  int32_t lane[W];
+  store(lane, number);
+  for (int l = 0; l < W; ++l) touched[lane[l]] = 1;
+}
+
+alignas(16) static const float kZeroRow[kFeatureRow] = {0, 0, 0, 0};
+
+// Points the odd lanes of a cell to copies of their rows.
+SNH_INLINE void copy_odd_cells(const SimdField& field, Lookup& lookup, uint32_t odd, const veci (&slot)[4],
+                               int64_t at) {
+  int32_t lane_slot[4][W];
+  for (int c = 0; c < 4; ++c) store(lane_slot[c], slot[c]);
+  for (; odd; odd &= odd - 1) {
+    const int l = __builtin_ctz(odd);
+    OddCell& cell = lookup.odd[lookup.n_odd];
+    float* rows = lookup.scratch + static_cast<int64_t>(lookup.n_odd++) * kOddFloats;
+    cell.at = static_cast<int32_t>(at + l);
+    for (int c = 0; c < 4; ++c) {
+      const int32_t s = cell.slot[c] = lane_slot[c][l];
+      const float* row = field.features + static_cast<int64_t>(s) * kFeatureRow;
+      store4(rows + c * kFeatureRow, load4(s < 0 ? kZeroRow : row));
+    }
+    lookup.pair[at + l] = rows;
+    lookup.pair[at + W + l] = rows + 2 * kFeatureRow;
+  }
+}
+
+// First stage for the W points of a group. kValid: returns the lanes where not all vertices exist.
 template <bool kValid>
-SNH_INLINE bool find_corners(const SimdField& field, const LookupRows& rows, const vec (&x)[3], int n,
-                             int64_t ld, veci& exists) {
-  veci all_places{};
-  exists = splat(-1);
+SNH_INLINE uint32_t find_corners(const SimdField& field, Lookup& lookup, const vec (&x)[3], int group) {
+  const veci side = splat(kBrickSide - 1);
+  uint32_t missing = 0;
+  int64_t at = group * pairs_per_group(field);
   for (int level = 0; level < field.n_levels; ++level) {
-    vec cells[3], fraction[3];
+    vec fraction[3];
     veci index[3];
     for (int a = 0; a < 3; ++a) {
-      cells[a] =
-          min(max(x[a] * field.inv_cell[level], splat(-5.3e8f)), splat(5.3e8f));  // as floor_cell saturates
-      index[a] = to_int(cells[a]);
-      index[a] += to_float(index[a]) > cells[a];  // a comparison that holds is -1: floor
-      fraction[a] = cells[a] - to_float(index[a]);
+      const vec cells =
+          min(max(x[a] * field.inv_cell[level], splat(-5.3e8f)), splat(5.3e8f));  // as floor_cell
+      index[a] = to_int(cells);
+      index[a] += to_float(index[a]) > cells;  // a comparison that holds is -1: floor
+      fraction[a] = cells - to_float(index[a]);
     }
-    for (int plane = 0; plane < kPlanes; ++plane) {
-      const int cell = level * kPlanes + plane;
+    for (int plane = 0; plane < kPlanes; ++plane, at += 2 * W) {
       const veci i = index[axis_u(plane)], j = index[axis_v(plane)];
-      veci number[4];
-      const bool full = find_quads(field, rows, level, plane, i >> kBrickBits, j >> kBrickBits, number);
-      const veci side = splat(kBrickSide - 1);
-      const veci cross_i = (i & side) == side, cross_j = (j & side) == side;
-      number[1] = cross_i ? number[1] : number[0];
-      number[3] = cross_i ? number[3] : number[2];
-      number[2] = cross_j ? number[2] : number[0];
-      number[3] = cross_j ? number[3] : number[1];
-      for (int c = 0; c < 4; ++c) {
-        const veci local = ((i + (c & 1)) & side) | (((j + (c >> 1)) & side) << kBrickBits);
-        const veci place = (number[c] * kBrickVertices + local) * 2;
-        store(rows.place + (cell * 4 + c) * ld + n, place);
-        all_places |= place;
-        if (kValid && !full) exists &= vertex_exists(field, number[c], local);
+      const veci brick_i = i >> kBrickBits, brick_j = j >> kBrickBits;
+      const veci local_i = i & side, local_j = (j & side) << kBrickBits,
+                 local_j1 = ((j + 1) & side) << kBrickBits;
+      const veci cross_j = (j & side) == side;
+      const bool any_cross_j = bits(cross_j) != 0;
+      const veci low = find_entries(field, level, plane, brick_i, brick_j);  // of the pair at j
+      veci high = low;                                                       // of the pair at j+1
+      if (any_cross_j) high = find_entries(field, level, plane, brick_i, brick_j - cross_j);
+      veci slot[4] = {(low >> 1) * kBrickVertices + (local_i | local_j),
+                      {},
+                      (high >> 1) * kBrickVertices + (local_i | local_j1),
+                      {}};
+      store_addresses(lookup.pair + at, field.features, slot[0]);
+      store_addresses(lookup.pair + at + W, field.features, slot[2]);
+      store(lookup.fraction + at, fraction[axis_u(plane)]);
+      store(lookup.fraction + at + W, fraction[axis_v(plane)]);
+      if (lookup.touched) {
+        touch(lookup.touched, low >> 1);
+        if (any_cross_j) touch(lookup.touched, high >> 1);
       }
-      store(rows.fraction + (cell * 2) * ld + n, fraction[axis_u(plane)]);
-      store(rows.fraction + (cell * 2 + 1) * ld + n, fraction[axis_v(plane)]);
+
+      const veci cross_i = local_i == side;
+      const uint32_t odd = bits(cross_i | (low < 0) | (high < 0));
+      if (odd) {
+        const veci low1 = find_entries(field, level, plane, brick_i - cross_i, brick_j);
+        veci high1 = low1;
+        if (any_cross_j) high1 = find_entries(field, level, plane, brick_i - cross_i, brick_j - cross_j);
+        const veci local_i1 = (i + 1) & side;
+        slot[1] = (low1 >> 1) * kBrickVertices + (local_i1 | local_j);
+        slot[3] = (high1 >> 1) * kBrickVertices + (local_i1 | local_j1);
+        if (lookup.touched) {
+          touch(lookup.touched, low1 >> 1);
+          if (any_cross_j) touch(lookup.touched, high1 >> 1);
+        }
+        copy_odd_cells(field, lookup, odd, slot, at);
+      }
+      if (kValid && (odd || bits((low & high & 1) == 0))) {
+        const veci ones = splat(1);
+        const veci right = odd ? slot[1] : slot[0] + ones, high_right = odd ? slot[3] : slot[2] + ones;
+        missing |= bits(~(vertex_exists(field, slot[0]) & vertex_exists(field, right) &
+                          vertex_exists(field, slot[2]) & vertex_exists(field, high_right)));
+      }
     }
   }
-  return bits(all_places < 0) == 0;
+  return missing;
 }
 
-alignas(16) static const float kZeroRow[4] = {0, 0, 0, 0};
-
-template <bool kComplete>
-SNH_INLINE vec4 feature_row(const float* features, int32_t place) {
-  const float* row = features + static_cast<int64_t>(place) * 2;
-  if (!kComplete) row = place < 0 ? kZeroRow : row;
-  return load4(row);
+// Weights of a pair at fraction u: 1 - u and u, each for a row.
+SNH_INLINE vec8 pair_weights(float u) {
+  const vec8 at_zero{1, 1, 1, 1, 0, 0, 0, 0}, slope{-1, -1, -1, -1, 1, 1, 1, 1};
+  return at_zero + u * slope;
 }
 
-// Floats per point that encode_points leaves for the derivative to the point: d encoded / d xyz of each level in cells.
-constexpr int kJacobianFloats = 3 * 4;
+// Floats per point and level that encode_points leaves for points_backward: d encoded / d xyz, per cell.
+constexpr int kJacobianFloats = 3 * kFeatureRow;
 
-// Second stage for W points at column n: rows of `encoded` [L * F][ld], and the derivatives for points_backward.
-template <bool kComplete, bool kJacobian>
-SNH_INLINE void encode_points(const SimdField& field, const LookupRows& rows, int n, int64_t ld,
+// Second stage for group `group` of points, which starts at column n: rows of `encoded` [L * F][ld].
+template <bool kJacobian>
+SNH_INLINE void encode_points(const SimdField& field, const Lookup& lookup, int group, int64_t ld,
                               float* encoded, float* jacobian) {
-  const int F = field.n_features;
-  for (int quad = n; quad < n + W; quad += 4)
-    for (int level = 0; level < field.n_levels; ++level) {
+  const vec8 slope_u{-1, -1, -1, -1, 1, 1, 1, 1};
+  const int n_levels = field.n_levels, n_features = field.n_features;
+  for (int quad = 0; quad < W; quad += 4) {
+    const float* const* pair = lookup.pair + group * pairs_per_group(field) + quad;
+    const float* fraction = lookup.fraction + group * pairs_per_group(field) + quad;
+    float* out = encoded + group * W + quad;
+    for (int level = 0; level < n_levels; ++level, pair += kPlanes * 2 * W, fraction += kPlanes * 2 * W) {
       vec4 value[4];
+#pragma GCC unroll 4
       for (int p = 0; p < 4; ++p) {
-        vec4 sum{}, slope[3] = {};
+        vec8 sum{}, slope[3] = {};
         for (int plane = 0; plane < kPlanes; ++plane) {
-          const int cell = level * kPlanes + plane;
-          const int32_t* place = rows.place + cell * 4 * ld + quad + p;
-          const vec4 r00 = feature_row<kComplete>(field.features, place[0]);
-          const vec4 r10 = feature_row<kComplete>(field.features, place[ld]);
-          const vec4 r01 = feature_row<kComplete>(field.features, place[2 * ld]);
-          const vec4 r11 = feature_row<kComplete>(field.features, place[3 * ld]);
-          const float u = rows.fraction[cell * 2 * ld + quad + p],
-                      v = rows.fraction[(cell * 2 + 1) * ld + quad + p];
-          const vec4 along0 = r10 - r00, along1 = r11 - r01;
-          const vec4 low = r00 + u * along0, high = r01 + u * along1;
-          sum += low + v * (high - low);
+          const int at = plane * 2 * W + p;
+          const vec8 low = load8(pair[at]), along_v = load8(pair[at + W]) - low;
+          const vec8 weights = pair_weights(fraction[at]);
+          const vec8 between = low + fraction[at + W] * along_v;
+          sum += weights * between;
           if (kJacobian) {
-            slope[axis_u(plane)] += along0 + v * (along1 - along0);
-            slope[axis_v(plane)] += high - low;
+            slope[axis_u(plane)] += slope_u * between;
+            slope[axis_v(plane)] += weights * along_v;
           }
         }
-        value[p] = sum;
+        value[p] = fold(sum);
         if (kJacobian)
-          for (int a = 0; a < 3; ++a, jacobian += 4) store4(jacobian, slope[a]);
+          for (int a = 0; a < 3; ++a, jacobian += kFeatureRow) store4(jacobian, fold(slope[a]));
       }
       transpose4(value);
-      for (int f = 0; f < F; ++f) store4(encoded + (level * F + f) * ld + quad, value[f]);
+      for (int f = 0; f < n_features; ++f, out += ld) store4(out, value[f]);
     }
+  }
 }
 
-template <bool kComplete>
-SNH_INLINE void add_row(float* grad_features, int32_t place, vec4 grad) {
-  if (!kComplete && place < 0) return;
-  float* row = grad_features + static_cast<int64_t>(place) * 2;
-  store4(row, load4(row) + grad);
+// The gradient that belongs to a feature row.
+SNH_INLINE float* gradient_of(const float* row, int64_t to_gradient) {
+  return reinterpret_cast<float*>(reinterpret_cast<intptr_t>(row) + to_gradient);
 }
 
-// Backward of the look-up for W points at column n: from grad_encoded [L * F][ld] to the features (if kScatter) and
-// to the points, grad_x [3][ld] (written).
-template <bool kComplete, bool kScatter>
-SNH_INLINE void points_backward(const SimdField& field, const LookupRows& rows, int n, int64_t ld,
-                                const float* grad_encoded, const float* jacobian, float* grad_features,
+SNH_INLINE void add_pair(float* pair, vec8 grad) { store8(pair, load8(pair) + grad); }
+
+// Backward of the look-up for a group: from grad_encoded [L * F][ld] to the points, grad_x [3][ld] (written), and, if
+// kScatter, to the features. Gradients lie `to_gradient` bytes behind the addresses in `pair`.
+template <bool kScatter>
+SNH_INLINE void points_backward(const SimdField& field, const Lookup& lookup, int group, int64_t ld,
+                                const float* grad_encoded, const float* jacobian, int64_t to_gradient,
                                 float* grad_x) {
-  const int F = field.n_features;
-  for (int quad = n; quad < n + W; quad += 4) {
+  const int n_levels = field.n_levels, n_features = field.n_features;
+  for (int quad = 0; quad < W; quad += 4) {
+    const float* const* pair = lookup.pair + group * pairs_per_group(field) + quad;
+    const float* fraction = lookup.fraction + group * pairs_per_group(field) + quad;
+    const int n = group * W + quad;
+    const float* from = grad_encoded + n;
     vec4 along[3][4] = {};
-    for (int level = 0; level < field.n_levels; ++level) {
+    for (int level = 0; level < n_levels; ++level, pair += kPlanes * 2 * W, fraction += kPlanes * 2 * W) {
+      const float inv_cell = field.inv_cell[level];
       vec4 grad[4] = {};
-      for (int f = 0; f < F; ++f) grad[f] = load4(grad_encoded + (level * F + f) * ld + quad);
+      for (int f = 0; f < n_features; ++f, from += ld) grad[f] = load4(from);
       transpose4(grad);
+#pragma GCC unroll 4
       for (int p = 0; p < 4; ++p) {
-        const vec4 g = grad[p], per_metre = g * field.inv_cell[level];
-        for (int a = 0; a < 3; ++a, jacobian += 4) along[a][p] += per_metre * load4(jacobian);
+        const vec4 per_metre = grad[p] * inv_cell;
+        for (int a = 0; a < 3; ++a, jacobian += kFeatureRow) along[a][p] += per_metre * load4(jacobian);
         if (!kScatter) continue;
+        const vec8 grad2 = twice(grad[p]);
         for (int plane = 0; plane < kPlanes; ++plane) {
-          const int cell = level * kPlanes + plane;
-          const int32_t* place = rows.place + cell * 4 * ld + quad + p;
-          const float u = rows.fraction[cell * 2 * ld + quad + p],
-                      v = rows.fraction[(cell * 2 + 1) * ld + quad + p];
-          const vec4 g1 = u * g, g0 = g - g1;
-          const vec4 g11 = v * g1, g01 = v * g0;
-          add_row<kComplete>(grad_features, place[0], g0 - g01);
-          add_row<kComplete>(grad_features, place[ld], g1 - g11);
-          add_row<kComplete>(grad_features, place[2 * ld], g01);
-          add_row<kComplete>(grad_features, place[3 * ld], g11);
+          const int at = plane * 2 * W + p;
+          const vec8 both = grad2 * pair_weights(fraction[at]), high = fraction[at + W] * both;
+          add_pair(gradient_of(pair[at], to_gradient), both - high);
+          add_pair(gradient_of(pair[at + W], to_gradient), high);
         }
       }
     }
     for (int a = 0; a < 3; ++a) {
       transpose4(along[a]);
-      store4(grad_x + a * ld + quad, (along[a][0] + along[a][1]) + (along[a][2] + along[a][3]));
+      store4(grad_x + a * ld + n, (along[a][0] + along[a][1]) + (along[a][2] + along[a][3]));
     }
   }
+}
+
+// Before the first points_backward of a block: the scratch rows become gradients of the odd cells, zero.
+inline void prepare_odd_cells(const Lookup& lookup, int64_t to_gradient) {
+  for (int k = 0; k < lookup.n_odd; ++k) {
+    for (int c = 0; c < 4; ++c) store4(lookup.scratch + k * kOddFloats + c * kFeatureRow, vec4{});
+    const float** pair = lookup.pair + lookup.odd[k].at;
+    pair[0] = gradient_of(pair[0], -to_gradient);
+    pair[W] = gradient_of(pair[W], -to_gradient);
+  }
+}
+
+// After the last points_backward of a block.
+inline void add_odd_cells(const Lookup& lookup, float* grad_features) {
+  for (int k = 0; k < lookup.n_odd; ++k)
+    for (int c = 0; c < 4; ++c) {
+      const int32_t slot = lookup.odd[k].slot[c];
+      if (slot < 0) continue;
+      float* row = grad_features + static_cast<int64_t>(slot) * kFeatureRow;
+      store4(row, load4(row) + load4(lookup.scratch + k * kOddFloats + c * kFeatureRow));
+    }
 }
 
 }  // namespace snh::SNH_SIMD

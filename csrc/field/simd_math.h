@@ -4,7 +4,10 @@
 
 #include <cstdint>
 #ifdef __SSE2__
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"  // of GCC 12 about its own header
 #include <immintrin.h>
+#pragma GCC diagnostic pop
 #endif
 
 #define SNH_INLINE inline __attribute__((always_inline))
@@ -17,10 +20,12 @@ typedef float vec __attribute__((vector_size(4 * W)));
 typedef int32_t veci __attribute__((vector_size(4 * W)));
 typedef uint32_t vecu __attribute__((vector_size(4 * W)));
 typedef float vec4 __attribute__((vector_size(16)));  // a feature row
+typedef float vec8 __attribute__((vector_size(32)));  // two feature rows
 
 typedef float vec_any __attribute__((vector_size(4 * W), aligned(4), may_alias));
 typedef int32_t veci_any __attribute__((vector_size(4 * W), aligned(4), may_alias));
 typedef float vec4_any __attribute__((vector_size(16), aligned(4), may_alias));
+typedef float vec8_any __attribute__((vector_size(32), aligned(4), may_alias));
 
 SNH_INLINE vec load(const float* p) { return *reinterpret_cast<const vec_any*>(p); }
 SNH_INLINE void store(float* p, vec x) { *reinterpret_cast<vec_any*>(p) = x; }
@@ -29,9 +34,17 @@ SNH_INLINE void store(int32_t* p, veci x) { *reinterpret_cast<veci_any*>(p) = x;
 SNH_INLINE vec4 load4(const float* p) { return *reinterpret_cast<const vec4_any*>(p); }
 SNH_INLINE void store4(float* p, vec4 x) { *reinterpret_cast<vec4_any*>(p) = x; }
 
+SNH_INLINE vec8 load8(const float* p) { return *reinterpret_cast<const vec8_any*>(p); }
+SNH_INLINE void store8(float* p, vec8 x) { *reinterpret_cast<vec8_any*>(p) = x; }
+
 SNH_INLINE vec splat(float x) { return x - vec{}; }
 SNH_INLINE veci splat(int32_t x) { return x - veci{}; }
-SNH_INLINE vec4 splat4(float x) { return vec4{x, x, x, x}; }
+
+// Sum of the two halves, and the row twice.
+SNH_INLINE vec4 fold(vec8 x) {
+  return __builtin_shufflevector(x, x, 0, 1, 2, 3) + __builtin_shufflevector(x, x, 4, 5, 6, 7);
+}
+SNH_INLINE vec8 twice(vec4 x) { return __builtin_shufflevector(x, x, 0, 1, 2, 3, 0, 1, 2, 3); }
 
 SNH_INLINE vec to_float(veci x) { return __builtin_convertvector(x, vec); }
 SNH_INLINE veci to_int(vec x) { return __builtin_convertvector(x, veci); }  // towards zero
@@ -80,6 +93,26 @@ SNH_INLINE veci gather(const int32_t* base, veci index) {
   veci result;
   for (int l = 0; l < W; ++l) result[l] = base[index[l]];
   return result;
+#endif
+}
+
+// out[l] = address of row slot[l] of `rows`, 4 floats each.
+SNH_INLINE void store_addresses(const float** out, const float* rows, veci slot) {
+#if SNH_SIMD_WIDTH == 16 && defined(__AVX512F__)
+  const __m512i base = _mm512_set1_epi64(reinterpret_cast<intptr_t>(rows));
+  const __m512i low = _mm512_cvtepi32_epi64(_mm512_castsi512_si256(reinterpret_cast<__m512i>(slot)));
+  const __m512i high = _mm512_cvtepi32_epi64(_mm512_extracti64x4_epi64(reinterpret_cast<__m512i>(slot), 1));
+  _mm512_storeu_si512(out, _mm512_add_epi64(base, _mm512_slli_epi64(low, 4)));
+  _mm512_storeu_si512(out + 8, _mm512_add_epi64(base, _mm512_slli_epi64(high, 4)));
+#elif SNH_SIMD_WIDTH == 8 && defined(__AVX2__)
+  const __m256i base = _mm256_set1_epi64x(reinterpret_cast<intptr_t>(rows));
+  const __m256i low = _mm256_cvtepi32_epi64(_mm256_castsi256_si128(reinterpret_cast<__m256i>(slot)));
+  const __m256i high = _mm256_cvtepi32_epi64(_mm256_extracti128_si256(reinterpret_cast<__m256i>(slot), 1));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(out), _mm256_add_epi64(base, _mm256_slli_epi64(low, 4)));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + 4),
+                      _mm256_add_epi64(base, _mm256_slli_epi64(high, 4)));
+#else
+  for (int l = 0; l < W; ++l) out[l] = rows + static_cast<int64_t>(slot[l]) * 4;
 #endif
 }
 
