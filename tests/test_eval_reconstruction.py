@@ -143,6 +143,17 @@ def test_protocols_keep_what_they_say():
             seen_faces(mesh, CAMERA, eye, protocol, extra)
 
 
+def test_a_moved_and_turned_camera_sees_what_is_before_it():
+    mesh = hiding_plates()
+    front, back, outside = np.split(np.arange(len(mesh.faces)), 3)
+    moved = look_at(np.array([3.5, 0, 0]), np.array([3.5, 0, 1]), UP)[None]
+    keeps = seen_faces(mesh, CAMERA, moved, "frustum")
+    assert keeps[outside].all() and not keeps[front].any()
+    turned = look_at(np.array([-1.0, 0, 1]), np.array([0, 0, 1.0]), UP)[None]  # along the plates, from their side
+    keeps = seen_faces(mesh, CAMERA, turned, "frustum")
+    assert keeps[front].all() and keeps[outside].all() and 0 < keeps[back].sum() < len(back)
+
+
 def test_occlusion_leaves_three_centimetres():
     eye = np.eye(4)[None]
     for gap, kept in ((0.025, True), (0.035, False)):
@@ -248,6 +259,18 @@ def test_all_errors_of_a_room_with_a_missing_side(protocol):
         lost = reference.select_faces(kept & ceiling).area() / reference.select_faces(kept).area()
         assert 100 - error["completion_ratio_5cm_pct"] == pytest.approx(100 * lost, abs=2.5)  # a strip of 5 cm is near
     assert error["missing_pct"] > 1 and error["depth_l1_cm"] > 1
+
+
+def test_border_of_what_is_seen():
+    """A face counts for the surface if any corner is seen and for the depth if all are. Of the mesh, which has the
+    latter faces only, the fringe is missing, but no pixel."""
+    reference = refined(box([0, 0, 0], [4, 2.5, 3], 4))
+    T_wc = look_at(np.array([1, 1.2, 1]), np.array([4, 1.2, 2.5]), UP)[None]
+    mesh = reference.select_faces(seen_vertices(reference, CAMERA, T_wc, "frustum")[reference.faces].all(axis=1))
+    error = evaluate_reconstruction(mesh, reference, CAMERA, T_wc, "frustum", "surface", n_points=N, n_views=10)
+    assert error["accuracy_cm"] < 1e-3
+    assert 0.005 < error["completion_cm"] < 0.2
+    assert error["missing_pct"] < 1e-2 and error["depth_l1_cm"] < 1e-2
 
 
 def test_nothing_to_evaluate_is_refused():
